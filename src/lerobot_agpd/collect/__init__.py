@@ -1,0 +1,1 @@
+"""Guided rollouts: strategies, success filter, episodes."""

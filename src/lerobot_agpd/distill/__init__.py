@@ -1,0 +1,1 @@
+"""The method: two stages, the adversary, the student mixin."""

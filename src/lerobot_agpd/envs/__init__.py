@@ -1,0 +1,1 @@
+"""Simulated environments that this plugin adds to LeRobot, and scripted experts for them."""

@@ -1,0 +1,180 @@
+"""Scripted experts for the Fetch tasks: pure functions of one observation.
+
+Nothing is remembered between steps. What to do next follows from the geometry of the moment, so a policy cloned from
+the demonstrations sees everything that its expert saw. Stages blend into each other over a few millimetres or
+centimetres instead of switching, so that actions change smoothly.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_agpd.envs.gymnasium_robotics import AGENT_POS, ENVIRONMENT_STATE
+
+Array = NDArray[np.float64]
+Expert = Callable[[dict[str, np.ndarray]], np.ndarray]
+
+# Action units per metre of position error. An action of 1 asks for 5 cm per step, so 20 would be dead beat for an arm
+# without lag.
+POSITION_GAIN = 10.0
+
+OPEN, CLOSE = 1.0, -1.0
+
+
+@dataclass(frozen=True)
+class FetchScene:
+    """One observation of a Fetch task with an object, by name. Positions (3,) in metres, world frame.
+
+    Attributes:
+        grip: position between the fingertips.
+        width: distance between the fingers, 0 closed, about 0.1 open, 0.05 around the block.
+        block: position of the block's centre.
+        goal: where the block shall be.
+    """
+
+    grip: Array
+    width: float
+    block: Array
+    goal: Array
+
+    @classmethod
+    def from_observation(cls, observation: dict[str, np.ndarray]) -> "FetchScene":
+        """Read `agent_pos` (10,) and `environment_state` (18,) of one environment.
+
+        Raises:
+            ValueError: if the shapes differ, for instance because the observation is batched.
+        """
+        agent, scene = _state_vectors(observation, 18)
+        return cls(grip=agent[:3], width=float(agent[3] + agent[4]), block=scene[:3], goal=scene[-3:])
+
+
+def _state_vectors(observation: dict[str, np.ndarray], environment_dim: int) -> tuple[Array, Array]:
+    """Return `agent_pos` (10,) and `environment_state` (environment_dim,) in float64, their shapes checked."""
+    agent = np.asarray(observation[AGENT_POS], dtype=np.float64)
+    scene = np.asarray(observation[ENVIRONMENT_STATE], dtype=np.float64)
+    if agent.shape != (10,) or scene.shape != (environment_dim,):
+        raise ValueError(
+            f"Expected {AGENT_POS} (10,) and {ENVIRONMENT_STATE} ({environment_dim},) of a single environment, "
+            f"got {agent.shape} and {scene.shape}."
+        )
+    return agent, scene
+
+
+def _ramp(value: float, zero_at: float, one_at: float) -> float:
+    """Rise linearly from 0 at `zero_at` to 1 at `one_at` (or fall, if `one_at` is the smaller), clipped."""
+    return float(np.clip((value - zero_at) / (one_at - zero_at), 0.0, 1.0))
+
+
+def _action(displacement: Array, gripper: float, gain: float = POSITION_GAIN) -> np.ndarray:
+    """Proportional action (4,) in [-1, 1], float32, for a wanted displacement (3,) in metres."""
+    return np.clip(np.append(gain * displacement, gripper), -1.0, 1.0).astype(np.float32)
+
+
+def fetch_reach_expert(observation: dict[str, np.ndarray]) -> np.ndarray:
+    """Go straight to the goal.
+
+    Args:
+        observation: `agent_pos` (10,), `environment_state` (3,).
+
+    Returns:
+        Action (4,) in [-1, 1], float32.
+    """
+    agent, goal = _state_vectors(observation, 3)
+    return _action(goal - agent[:3], gripper=0.0)
+
+
+def fetch_pick_and_place_expert(observation: dict[str, np.ndarray]) -> np.ndarray:
+    """Descend onto the block in a funnel, close around it, carry it to the goal.
+
+    The hand keeps a height that falls with the horizontal distance to the block and with the opening of the fingers.
+    The fingers close where the block is between them. The motion to the goal fades in as their distance falls to the
+    width of the block, and ends if the block is lost.
+
+    Args:
+        observation: `agent_pos` (10,), `environment_state` (18,).
+
+    Returns:
+        Action (4,) in [-1, 1], float32.
+    """
+    scene = FetchScene.from_observation(observation)
+    to_block = scene.block - scene.grip
+    between_fingers = _ramp(float(np.linalg.norm(to_block)), zero_at=0.035, one_at=0.020)
+    held = between_fingers * _ramp(scene.width, zero_at=0.058, one_at=0.052)
+
+    sideways = float(np.linalg.norm(to_block[:2]))
+    clearance = 0.10 * max(
+        _ramp(sideways, zero_at=0.008, one_at=0.05), (1 - between_fingers) * _ramp(scene.width, 0.09, 0.07)
+    )
+    approach = to_block + np.array([0.0, 0.0, clearance])
+    carry = scene.goal - scene.block
+    gripper = OPEN + (CLOSE - OPEN) * between_fingers
+    return _action((1.0 - held) * approach + held * carry, gripper)
+
+
+def fetch_push_expert(observation: dict[str, np.ndarray]) -> np.ndarray:
+    """Go behind the block, seen from the goal, and push it there.
+
+    Args:
+        observation: `agent_pos` (10,), `environment_state` (18,).
+
+    Returns:
+        Action (4,) in [-1, 1], float32.
+    """
+    scene = FetchScene.from_observation(observation)
+    to_goal = scene.goal[:2] - scene.block[:2]
+    distance = float(np.linalg.norm(to_goal))
+    forward = to_goal / max(distance, 1e-6)
+    from_block = scene.grip[:2] - scene.block[:2]
+    behind = -float(from_block @ forward)
+    sideways = from_block + behind * forward
+    above = float(scene.grip[2] - scene.block[2])
+
+    needed = 0.03 + 0.025 * _ramp(above, zero_at=0.02, one_at=0.05)
+    clear_of_block = _ramp(behind, zero_at=needed - 0.01, one_at=needed)
+    in_line = clear_of_block * _ramp(float(np.linalg.norm(sideways)), zero_at=0.03, one_at=0.015)
+    pushing = in_line * _ramp(above, zero_at=0.03, one_at=0.015)
+
+    start = -0.065 * forward - from_block
+    free = max(_ramp(float(np.linalg.norm(from_block)), F0, F1), _ramp(above, A0, A1))
+    push = min(distance + behind - CONTACT, SPEED) * forward - SIDE * sideways
+    horizontal = (1.0 - pushing) * free * start + pushing * push
+    vertical = HIGH * (1.0 - in_line) - above
+    away_from_goal = _ramp(distance, zero_at=CALM0, one_at=CALM1)
+    return _action(away_from_goal * np.append(horizontal, vertical), gripper=0.0)
+
+
+CONTACT=0.04
+SPEED=0.06
+F0=0.05
+F1=0.08
+A0=0.02
+A1=0.05
+HIGH=0.07
+SIDE=2.0
+CALM0=0.015
+CALM1=0.03
+EXPERTS: dict[str, Expert] = {
+    "FetchReach-v4": fetch_reach_expert,
+    "FetchPush-v4": fetch_push_expert,
+    "FetchPickAndPlace-v4": fetch_pick_and_place_expert,
+}
+
+
+def make_expert(task: str) -> Expert:
+    """Find the expert of a task.
+
+    Args:
+        task: a task of the `gymnasium_robotics` environment type.
+
+    Returns:
+        A pure function from the raw observation of a single environment (`agent_pos`, `environment_state`) to an
+        action in [-1, 1].
+
+    Raises:
+        ValueError: if the task has no expert.
+    """
+    if task not in EXPERTS:
+        raise ValueError(f"No scripted expert for {task!r}. Tasks with one: {', '.join(EXPERTS)}.")
+    return EXPERTS[task]

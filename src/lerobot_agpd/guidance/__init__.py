@@ -1,0 +1,1 @@
+"""Guided sampling: discrepancy J, representation, guided schedulers, teacher wrapper."""

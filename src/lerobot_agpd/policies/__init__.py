@@ -1,0 +1,1 @@
+"""Policy types this plugin registers, one folder per `--policy.type`."""

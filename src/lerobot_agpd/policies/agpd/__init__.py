@@ -1,0 +1,1 @@
+"""The ACT student trained by AGPD."""

@@ -1,0 +1,1 @@
+"""Diffusion policy with an exchangeable denoiser."""

@@ -1,0 +1,105 @@
+"""What the command line (or config file) says of the running `lerobot-train`, which a policy is never told."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from contextlib import contextmanager
+from collections.abc import Iterator
+from contextvars import ContextVar
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import draccus
+import yaml
+from lerobot.configs import parser
+from lerobot.configs.train import TRAIN_CONFIG_NAME
+from lerobot.envs import EnvConfig
+
+
+@dataclass(frozen=True)
+class RunInfo:
+    """Facts of a training run.
+
+    Attributes:
+        output_dir: where the run writes, or None if nobody named a folder.
+        env: the evaluation environment, or None.
+        steps: number of training steps, or None if unknown.
+        resume: whether the run continues a checkpoint.
+    """
+
+    output_dir: Path | None = None
+    env: EnvConfig | None = None
+    steps: int | None = None
+    resume: bool = False
+
+
+_declared: ContextVar[RunInfo | None] = ContextVar("declared_run", default=None)
+
+
+@contextmanager
+def declared_run(info: RunInfo) -> Iterator[None]:
+    """State the facts of a run that is started from Python rather than from a command line."""
+    token = _declared.set(info)
+    try:
+        yield
+    finally:
+        _declared.reset(token)
+
+
+def this_run() -> RunInfo:
+    """Facts of the run in this process: declared ones, else the command line over its config file."""
+    declared = _declared.get()
+    if declared is not None:
+        return declared
+    config = _config_file(parser.parse_arg("config_path"))
+    output_dir = parser.parse_arg("output_dir") or config.get("output_dir")
+    steps = parser.parse_arg("steps") or config.get("steps")
+    resume = parser.parse_arg("resume") or config.get("resume") or False
+    return RunInfo(
+        output_dir=Path(output_dir) if output_dir else None,
+        env=_env(config.get("env")),
+        steps=int(steps) if steps else None,
+        resume=resume if isinstance(resume, bool) else draccus.decode(bool, yaml.safe_load(resume)),
+    )
+
+
+def process_rank() -> int:
+    """Rank of this process among those that accelerate or torchrun started."""
+    return int(os.environ.get("RANK", "0"))
+
+
+def world_size() -> int:
+    """Number of processes of the run."""
+    return int(os.environ.get("WORLD_SIZE", "1"))
+
+
+def _config_file(path: str | None) -> dict[str, Any]:
+    """Contents of a `--config_path` file or checkpoint folder; empty for none and for a Hub repository."""
+    if not path:
+        return {}
+    file = Path(path) / TRAIN_CONFIG_NAME if Path(path).is_dir() else Path(path)
+    if not file.is_file():
+        return {}
+    text = file.read_text()
+    return (json.loads(text) if file.suffix == ".json" else yaml.safe_load(text)) or {}
+
+
+def _env(config: dict[str, Any] | None) -> EnvConfig | None:
+    """The environment of `--env.*`, its flags over the config file's entry."""
+    entry = dict(config or {})
+    chosen = parser.parse_arg("env.type") or entry.get("type")
+    if chosen is None:
+        return None
+    if chosen != entry.pop("type", None):
+        entry = {}  # another type on the command line: the file's fields are not its fields
+    with tempfile.NamedTemporaryFile("w", suffix=".json") as file, draccus.config_type("json"):
+        json.dump(entry, file)
+        file.flush()
+        return draccus.parse(
+            EnvConfig.get_choice_class(chosen),
+            config_path=file.name,
+            args=parser.get_cli_overrides("env") or [],
+        )
