@@ -2,7 +2,9 @@
 
 import multiprocessing
 
-import lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer
+import lerobot_agpd.envs.gymnasium_robotics
+import lerobot_agpd.policies.agpd.configuration_agpd
+import lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer  # noqa: F401
 
 FORKSERVER_PRELOAD = ["gym_pusht", "gym_aloha", "gymnasium_robotics"]
 """Packages whose import registers gymnasium environments. LeRobot's asynchronous vector environments start

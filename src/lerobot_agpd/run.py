@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from contextlib import contextmanager
 from collections.abc import Iterator
+from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import draccus
+import torch
 import yaml
 from lerobot.configs import parser
 from lerobot.configs.train import TRAIN_CONFIG_NAME
@@ -103,3 +104,18 @@ def _env(config: dict[str, Any] | None) -> EnvConfig | None:
             config_path=file.name,
             args=parser.get_cli_overrides("env") or [],
         )
+
+
+def barrier() -> None:
+    """Wait for all processes of the run."""
+    if torch.distributed.is_available() and torch.distributed.is_initialized():
+        torch.distributed.barrier()
+
+
+def broadcast(value: Any) -> Any:
+    """Rank 0's value, on every process."""
+    if not (torch.distributed.is_available() and torch.distributed.is_initialized()):
+        return value
+    values = [value]
+    torch.distributed.broadcast_object_list(values, src=0)
+    return values[0]

@@ -1,3 +1,3 @@
 """Discovery shim: LeRobot imports distributions named `lerobot_policy_*` by their own name."""
 
-import lerobot_agpd.plugin
+import lerobot_agpd.plugin  # noqa: F401

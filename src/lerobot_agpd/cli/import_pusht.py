@@ -84,7 +84,7 @@ def block_keypoints(block_poses: np.ndarray) -> np.ndarray:
 
 def dataset_features(variant: str) -> dict[str, dict[str, Any]]:
     """Features of lerobot/pusht_keypoints or lerobot/pusht that the recordings contain."""
-    vector = {"dtype": "float32", "names": None}
+    vector: dict[str, Any] = {"dtype": "float32", "names": None}
     features = {OBS_STATE: {**vector, "shape": (2,)}, ACTION: {**vector, "shape": (2,)}}
     if variant == "keypoints":
         features[OBS_ENV_STATE] = {**vector, "shape": (16,)}
@@ -100,7 +100,10 @@ def dataset_features(variant: str) -> dict[str, dict[str, Any]]:
 def import_pusht(config: ImportPushTConfig) -> LeRobotDataset:
     """Write the dataset, in a folder `<root>.partial` that is renamed when it is complete."""
     arrays = load_arrays(config)
-    frames = {OBS_STATE: arrays["state"][:, :2].astype(np.float32), ACTION: arrays["action"].astype(np.float32)}
+    frames = {
+        OBS_STATE: arrays["state"][:, :2].astype(np.float32),
+        ACTION: arrays["action"].astype(np.float32),
+    }
     if config.variant == "keypoints":
         frames[OBS_ENV_STATE] = block_keypoints(arrays["state"][:, 2:5])
     else:

@@ -16,11 +16,19 @@ from lerobot_agpd.envs.gymnasium_robotics import AGENT_POS, ENVIRONMENT_STATE
 Array = NDArray[np.float64]
 Expert = Callable[[dict[str, np.ndarray]], np.ndarray]
 
-# Action units per metre of position error. An action of 1 asks for 5 cm per step, so 20 would be dead beat for an arm
-# without lag.
+# Action units per metre of position error. An action of 1 asks for 5 cm in one step; the arm follows with a lag.
 POSITION_GAIN = 10.0
 
 OPEN, CLOSE = 1.0, -1.0
+
+# Height of the hand above the block's centre before it comes down to grasp or to push, metres.
+GRASP_CLEARANCE = 0.10
+PUSH_CLEARANCE = 0.08
+# Distance from the block's centre at which the hand comes down, and at which it touches, metres.
+PUSH_STANDOFF = 0.065
+PUSH_CONTACT = 0.04
+# How far ahead of itself a pushing hand aims at most, metres: this bounds the speed of the block.
+PUSH_STRIDE = 0.06
 
 
 @dataclass(frozen=True)
@@ -67,9 +75,9 @@ def _ramp(value: float, zero_at: float, one_at: float) -> float:
     return float(np.clip((value - zero_at) / (one_at - zero_at), 0.0, 1.0))
 
 
-def _action(displacement: Array, gripper: float, gain: float = POSITION_GAIN) -> np.ndarray:
+def _action(displacement: Array, gripper: float) -> np.ndarray:
     """Proportional action (4,) in [-1, 1], float32, for a wanted displacement (3,) in metres."""
-    return np.clip(np.append(gain * displacement, gripper), -1.0, 1.0).astype(np.float32)
+    return np.clip(np.append(POSITION_GAIN * displacement, gripper), -1.0, 1.0).astype(np.float32)
 
 
 def fetch_reach_expert(observation: dict[str, np.ndarray]) -> np.ndarray:
@@ -104,9 +112,8 @@ def fetch_pick_and_place_expert(observation: dict[str, np.ndarray]) -> np.ndarra
     held = between_fingers * _ramp(scene.width, zero_at=0.058, one_at=0.052)
 
     sideways = float(np.linalg.norm(to_block[:2]))
-    clearance = 0.10 * max(
-        _ramp(sideways, zero_at=0.008, one_at=0.05), (1 - between_fingers) * _ramp(scene.width, 0.09, 0.07)
-    )
+    fingers_shut = (1.0 - between_fingers) * _ramp(scene.width, zero_at=0.09, one_at=0.07)
+    clearance = GRASP_CLEARANCE * max(_ramp(sideways, zero_at=0.008, one_at=0.05), fingers_shut)
     approach = to_block + np.array([0.0, 0.0, clearance])
     carry = scene.goal - scene.block
     gripper = OPEN + (CLOSE - OPEN) * between_fingers
@@ -114,7 +121,10 @@ def fetch_pick_and_place_expert(observation: dict[str, np.ndarray]) -> np.ndarra
 
 
 def fetch_push_expert(observation: dict[str, np.ndarray]) -> np.ndarray:
-    """Go behind the block, seen from the goal, and push it there.
+    """Go behind the block, seen from the goal, lower the hand there and push until the block rests at the goal.
+
+    The hand stays `PUSH_CLEARANCE` above the block until it is behind it and in line with the goal, and rises again
+    if the block slips away to the side. Near the goal all motion fades out.
 
     Args:
         observation: `agent_pos` (10,), `environment_state` (18,).
@@ -131,30 +141,25 @@ def fetch_push_expert(observation: dict[str, np.ndarray]) -> np.ndarray:
     sideways = from_block + behind * forward
     above = float(scene.grip[2] - scene.block[2])
 
-    needed = 0.03 + 0.025 * _ramp(above, zero_at=0.02, one_at=0.05)
-    clear_of_block = _ramp(behind, zero_at=needed - 0.01, one_at=needed)
-    in_line = clear_of_block * _ramp(float(np.linalg.norm(sideways)), zero_at=0.03, one_at=0.015)
+    # A hand in the air needs more room to come down than a lowered hand, in contact, needs to stay down.
+    room = 0.03 + 0.025 * _ramp(above, zero_at=0.02, one_at=0.05)
+    is_behind = _ramp(behind, zero_at=room - 0.01, one_at=room)
+    in_line = is_behind * _ramp(float(np.linalg.norm(sideways)), zero_at=0.03, one_at=0.015)
     pushing = in_line * _ramp(above, zero_at=0.03, one_at=0.015)
+    # Close to the block and still low, rise before moving on: otherwise the hand drags the block along.
+    may_travel = max(
+        _ramp(float(np.linalg.norm(from_block)), zero_at=0.07, one_at=0.11),
+        _ramp(above, zero_at=0.03, one_at=0.06),
+    )
 
-    start = -0.065 * forward - from_block
-    free = max(_ramp(float(np.linalg.norm(from_block)), F0, F1), _ramp(above, A0, A1))
-    push = min(distance + behind - CONTACT, SPEED) * forward - SIDE * sideways
-    horizontal = (1.0 - pushing) * free * start + pushing * push
-    vertical = HIGH * (1.0 - in_line) - above
-    away_from_goal = _ramp(distance, zero_at=CALM0, one_at=CALM1)
+    travel = -PUSH_STANDOFF * forward - from_block
+    push = min(distance + behind - PUSH_CONTACT, PUSH_STRIDE) * forward - 2.0 * sideways
+    horizontal = (1.0 - pushing) * may_travel * travel + pushing * push
+    vertical = PUSH_CLEARANCE * (1.0 - in_line) - above
+    away_from_goal = _ramp(distance, zero_at=0.015, one_at=0.03)
     return _action(away_from_goal * np.append(horizontal, vertical), gripper=0.0)
 
 
-CONTACT=0.04
-SPEED=0.06
-F0=0.05
-F1=0.08
-A0=0.02
-A1=0.05
-HIGH=0.07
-SIDE=2.0
-CALM0=0.015
-CALM1=0.03
 EXPERTS: dict[str, Expert] = {
     "FetchReach-v4": fetch_reach_expert,
     "FetchPush-v4": fetch_push_expert,

@@ -64,7 +64,9 @@ class FrameTable:
         frames = dataset.hf_dataset.select_columns(["index", *keys]).with_format("torch")[:]
         index = torch.as_tensor(frames["index"])
         if not torch.equal(index, torch.arange(len(index))):
-            raise ValueError(f"frames of dataset '{dataset.repo_id}' are not stored in the order of their index")
+            raise ValueError(
+                f"frames of dataset '{dataset.repo_id}' are not stored in the order of their index"
+            )
         columns = {key: torch.as_tensor(frames[key]).float().reshape(len(index), -1) for key in keys}
         episodes = dataset.meta.episodes
         starts, ends = (torch.as_tensor(episodes[f"dataset_{side}_index"]) for side in ("from", "to"))

@@ -60,7 +60,10 @@ class FrameMemory:
         self.config = config
         self.keys = low_dimensional_keys(config)
         self.dataset = LeRobotDataset(
-            dataset_meta.repo_id, root=dataset_meta.root, revision=dataset_meta.revision, download_videos=False
+            dataset_meta.repo_id,
+            root=dataset_meta.root,
+            revision=dataset_meta.revision,
+            download_videos=False,
         )
         self.table = FrameTable.from_dataset(self.dataset, self.keys)  # raw units
         self._stats = dataset_stats if dataset_stats is not None else dataset_meta.stats

@@ -58,8 +58,12 @@ class DiffusionTransformerConfig(DiffusionConfig):
     denoiser: str = "mlp"  # network that predicts the noise (or the clean chunk)
     mlp: MLPDenoiserConfig = field(default_factory=MLPDenoiserConfig)
     ema: EMAConfig = field(default_factory=EMAConfig)
-    in_memory: bool = True  # cut chunks from columns in memory; false: LeRobot's loader delivers them (needed for images)
-    noise_samples_per_frame: int = 4  # noise levels drawn for every delivered frame, so that loading costs less
+    in_memory: bool = (
+        True  # cut chunks from columns in memory; false: LeRobot's loader delivers them (needed for images)
+    )
+    noise_samples_per_frame: int = (
+        4  # noise levels drawn for every delivered frame, so that loading costs less
+    )
 
     optimizer_lr: float = 5e-4
     optimizer_betas: tuple = (0.9, 0.999)

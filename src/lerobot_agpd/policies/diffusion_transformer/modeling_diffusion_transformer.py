@@ -46,8 +46,10 @@ class DiffusionTransformerPolicy(DiffusionPolicy):
         """Build the policy; with `dataset_meta` its frames are loaded into memory at the first training step."""
         super().__init__(config, **kwargs)
         self.config: DiffusionTransformerConfig = config
-        denoiser: nn.Module = make_denoiser(config, self.diffusion)
-        self.diffusion.unet = torch.compile(denoiser, mode=config.compile_mode) if config.compile_model else denoiser  # type: ignore[assignment]
+        denoiser: Any = make_denoiser(config, self.diffusion)
+        if config.compile_model:
+            denoiser = torch.compile(denoiser, mode=config.compile_mode)
+        self.diffusion.unet = denoiser
         self._dataset = (dataset_meta, dataset_stats)
         self._memory: FrameMemory | None = None
         self._ema: EMAModel | None = None
@@ -152,8 +154,10 @@ def make_denoiser(config: DiffusionTransformerConfig, model: DiffusionModel) -> 
     if config.env_state_feature is not None:
         per_step += config.env_state_feature.shape[0]
     if config.image_features:
-        encoders = model.rgb_encoder if isinstance(model.rgb_encoder, nn.ModuleList) else [model.rgb_encoder]
-        per_step += encoders[0].feature_dim * len(config.image_features)
+        encoder: Any = model.rgb_encoder
+        if isinstance(encoder, nn.ModuleList):
+            encoder = encoder[0]
+        per_step += encoder.feature_dim * len(config.image_features)
     return MLPDenoiser(
         horizon=config.horizon,
         action_dim=config.action_feature.shape[0],

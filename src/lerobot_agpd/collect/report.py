@@ -1,0 +1,49 @@
+"""What a collection round produced, in numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from lerobot_agpd.replay.episode import EpisodeRecord
+
+
+def tally(records: Sequence[EpisodeRecord]) -> dict[str, int]:
+    """Generated, successful and kept episodes; successes count among the non-trivial ones only."""
+    counted = [record for record in records if not record.trivial]
+    return {
+        "generated": len(records),
+        "trivial": len(records) - len(counted),
+        "successful": sum(record.passed for record in counted),
+        "kept": sum(record.kept for record in records),
+    }
+
+
+def success_rate(counts: Sequence[dict[str, int]]) -> float | None:
+    """Success rate over the non-trivial episodes of several tallies; None if there were none."""
+    counted = sum(count["generated"] - count["trivial"] for count in counts)
+    return sum(count["successful"] for count in counts) / counted if counted else None
+
+
+def summarise(records: Sequence[EpisodeRecord]) -> dict[str, Any]:
+    """The numbers of a round, guided and unguided episodes apart."""
+    guided = [record for record in records if record.scale > 0]
+    unguided = [record for record in records if record.scale == 0]
+    return {
+        **tally(records),
+        "guided": tally(guided),
+        "unguided": tally(unguided),
+        "mean_max_reward": _mean([record.max_reward for record in records]),
+        "mean_j_guided": _mean([record.j for record in guided]),
+        "mean_j_unguided": _mean([record.j for record in unguided]),
+        "mean_shift_in_sigmas": _mean([record.shift for record in guided]),
+        "kept_frames": sum(record.length for record in records if record.kept),
+        "episodes": [record.to_json() for record in records],
+    }
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.mean(finite)) if finite else None

@@ -1,0 +1,145 @@
+"""One collection round: this process's share of the episodes, from tickets to finished datasets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors
+from tqdm import tqdm
+
+from lerobot_agpd.collect.report import summarise
+from lerobot_agpd.collect.rollout import Decider, Rollouts, Stopwatch
+from lerobot_agpd.collect.seeds import noise_seed, round_tickets, share_of
+from lerobot_agpd.collect.success import SuccessFilter
+from lerobot_agpd.replay.episode import EpisodeRecord, Ticket
+from lerobot_agpd.replay.store import ReplayStore, Spool
+from lerobot_agpd.replay.writer import EpisodeWriter
+from lerobot_agpd.run import barrier
+
+
+class RoundRunner:
+    """Collects rounds with whatever strategy it is given.
+
+    Args:
+        store: where rounds go.
+        env_config: the environment.
+        policy_config: the student's configuration, with the `collect` group.
+        demonstrations: metadata of the demonstrations, whose features the datasets take over.
+        seed: of the run.
+        rank: of this process.
+        n_ranks: number of processes.
+    """
+
+    def __init__(
+        self,
+        store: ReplayStore,
+        env_config: EnvConfig,
+        policy_config: Any,
+        demonstrations: LeRobotDatasetMetadata,
+        seed: int,
+        rank: int,
+        n_ranks: int,
+    ):
+        self.store = store
+        self.env_config = env_config
+        self.policy_config = policy_config
+        self.config = policy_config.collect
+        self.filter = SuccessFilter.from_config(self.config)
+        self.writer = EpisodeWriter(demonstrations)
+        self.seed, self.rank, self.n_ranks = seed, rank, n_ranks
+
+    def noise(self, number: int) -> torch.Generator:
+        """Source of this process's sampling noise in a round."""
+        generator = torch.Generator(device=self.policy_config.device)
+        return generator.manual_seed(noise_seed(self.seed, self.rank, number))
+
+    def collect(
+        self, number: int, scale: float, decider: Decider
+    ) -> tuple[list[EpisodeRecord], dict[str, float]]:
+        """Roll out what is missing of the round, write this process's dataset and wait for the others.
+
+        Returns:
+            Records of all processes' episodes, and the seconds this one spent, by activity.
+        """
+        spool = self.store.spool(number, self.rank)
+        stopwatch = Stopwatch()
+        tickets = round_tickets(
+            share_of(self.config.episodes, self.rank, self.n_ranks),
+            self.seed,
+            self.rank,
+            number,
+            scale,
+            self.config.unguided_fraction,
+        )
+        missing = [ticket for ticket in tickets if ticket.number not in spool.records]
+        if missing:
+            self._roll_out(number, missing, len(tickets), decider, spool, stopwatch)
+        with stopwatch.measure("writing"):
+            self.store.write_share(
+                number,
+                self.rank,
+                lambda root, episodes: self.writer.write(root, episodes, number, self.config.strategy),
+            )
+        barrier()
+        return self.store.records(number, self.n_ranks), stopwatch.seconds
+
+    def _roll_out(
+        self,
+        number: int,
+        tickets: Sequence[Ticket],
+        n_total: int,
+        decider: Decider,
+        spool: Spool,
+        stopwatch: Stopwatch,
+    ) -> None:
+        n_envs = min(self.config.n_envs, len(tickets))
+        tasks = make_env(self.env_config, n_envs=n_envs, use_async_envs=self.config.use_async_envs)
+        environments = [envs for suite in tasks.values() for envs in suite.values()]
+        processors = make_env_pre_post_processors(self.env_config, self.policy_config)
+        progress = tqdm(
+            total=n_total,
+            initial=n_total - len(tickets),
+            desc=f"Collecting round {number}",
+            unit="episode",
+            leave=False,
+            disable=self.rank != 0,
+        )
+        try:
+            for position, envs in enumerate(environments):
+                rollouts = Rollouts(envs, processors, decider, stopwatch)
+                for episode in rollouts.run(tickets[position :: len(environments)]):
+                    with stopwatch.measure("writing"):
+                        spool.add(episode, self.filter.judge(episode))
+                    kept = sum(record.kept for record in spool.records.values())
+                    progress.set_postfix_str(f"{kept} of {len(spool.records)} kept")
+                    progress.update()
+        finally:
+            progress.close()
+            close_envs(tasks)
+
+    def report(
+        self, number: int, scale: float, records: Sequence[EpisodeRecord], seconds: Mapping[str, float]
+    ) -> dict[str, Any]:
+        """The round's numbers."""
+        return {
+            "round": number,
+            "strategy": self.config.strategy,
+            "scale": scale,
+            "environment": {"type": self.env_config.type, "task": self.env_config.task},
+            "teacher": self.policy_config.teacher.path,
+            "seconds": dict(seconds),
+            **summarise(records),
+        }
+
+    def finish(self, number: int, report: Mapping[str, Any]) -> None:
+        """Make the round a finished one; called on one process."""
+        self.store.finish(number, self.n_ranks, report)
+
+    def merge(self) -> None:
+        """Merge all rounds into one dataset and upload it if asked to; called on one process."""
+        merged = self.store.merge(self.config.repo_id or f"agpd/{self.store.root.resolve().parent.name}")
+        if merged is not None and self.config.push_to_hub:
+            merged.push_to_hub()

@@ -1,0 +1,45 @@
+"""Flags of the adversary."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lerobot_agpd.guidance.config import require
+
+FORMS = ("saturating", "non_saturating")
+
+
+@dataclass
+class AdversaryConfig:
+    """The discriminator D and the student's adversarial loss (Eq. 21-22)."""
+
+    weight: float = (
+        0.05  # s of Eq. 22, the adversarial loss's share of the student's objective; 0: no adversary
+    )
+    form: str = (
+        "saturating"  # saturating: the student minimises log D, as printed; non_saturating: -log(1 - D)
+    )
+    start: int = 500  # training steps before the adversary acts, so that D does not meet an untrained student
+    width: int = 128  # width of D's two hidden layers
+    lr: float = 1e-4  # learning rate of D
+    label_smoothing: float = 0.1  # D's target for teacher chunks, instead of 0
+    gradient_penalty: float = 1.0  # weight of the squared gradient norm of D's logit at teacher chunks (R1)
+    spectral_norm: bool = False  # bound the Lipschitz constant of D's layers
+
+    def __post_init__(self) -> None:
+        require(self.weight >= 0, f"--policy.adversary.weight must not be negative, got {self.weight}")
+        require(
+            self.form in FORMS,
+            f"--policy.adversary.form must be one of {list(FORMS)}, got '{self.form}'",
+        )
+        require(self.start >= 0, f"--policy.adversary.start must not be negative, got {self.start}")
+        require(self.width >= 1, f"--policy.adversary.width must be at least 1, got {self.width}")
+        require(self.lr > 0, f"--policy.adversary.lr must be positive, got {self.lr}")
+        require(
+            0 <= self.label_smoothing < 0.5,
+            f"--policy.adversary.label_smoothing must be in [0, 0.5), got {self.label_smoothing}",
+        )
+        require(
+            self.gradient_penalty >= 0,
+            f"--policy.adversary.gradient_penalty must not be negative, got {self.gradient_penalty}",
+        )

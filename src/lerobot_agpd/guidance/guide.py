@@ -1,0 +1,150 @@
+"""Guidance as a small object around a denoising step (Eq. 20, sign and DDIM repaired).
+
+One reverse step of the teacher has posterior mean mu and variance sigma^2. Guided, it becomes
+
+    x_{k-1} = mu - scale * sigma^2 * grad J + sigma * z,
+
+so that a positive scale moves the chunk *toward* the student. The sampling loop stays LeRobot's: the guide
+adds a shift to what the scheduler's `step` returns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from diffusers.schedulers.scheduling_ddim import DDIMScheduler
+from torch import Tensor, nn
+
+from lerobot_agpd.guidance.discrepancy import Discrepancy, gradient
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """A reverse step k -> k-1: its mean (B, H, A), its variance and the clean chunk x0_hat it assumes."""
+
+    mean: Tensor
+    variance: float
+    x0_hat: Tensor
+
+
+def posterior(scheduler: Any, timestep: int, x_t: Tensor, x0_hat: Tensor, prev_sample: Tensor) -> Posterior:
+    """Posterior of a diffusers DDPM or DDIM step, with strided schedules (DDPM, arXiv:2006.11239, Eq. 6-7).
+
+    At eta = 0, DDIM adds no noise and its own sigma is 0, which would switch guidance off; sigma^2 is
+    therefore always the DDPM posterior variance between the two noise levels of the step.
+
+    Args:
+        scheduler: a DDPMScheduler or DDIMScheduler whose timesteps are set.
+        timestep: k.
+        x_t: (B, H, A) the noisy chunk before the step.
+        x0_hat: (B, H, A) the predicted clean chunk (clipped, if the scheduler clips).
+        prev_sample: (B, H, A) the scheduler's own result; DDIM's is its mean.
+    """
+    if isinstance(scheduler, DDIMScheduler):
+        previous = timestep - scheduler.config.num_train_timesteps // scheduler.num_inference_steps
+    else:
+        previous = int(scheduler.previous_timestep(timestep))
+    abar = float(scheduler.alphas_cumprod[timestep])
+    abar_previous = float(scheduler.alphas_cumprod[previous]) if previous >= 0 else 1.0
+    alpha = abar / abar_previous
+    variance = (1 - abar_previous) / (1 - abar) * (1 - alpha)
+    if isinstance(scheduler, DDIMScheduler):
+        mean = prev_sample
+    else:
+        mean = (
+            abar_previous**0.5 * (1 - alpha) / (1 - abar) * x0_hat
+            + alpha**0.5 * (1 - abar_previous) / (1 - abar) * x_t
+        )
+    return Posterior(mean=mean, variance=variance, x0_hat=x0_hat)
+
+
+@dataclass
+class Guide:
+    """Pulls a teacher's chunks toward the student's.
+
+    Attributes:
+        discrepancy: J as a function of the teacher's chunk.
+        scale: (B,) guidance scale of every row; rows at 0 are sampled exactly as without a guide.
+        at: "x0" or "mu", where J is differentiated.
+        trust_region: largest root-mean-square shift over the guided entries, in sigmas.
+        callback: called with a dict after every step (`timestep`, `sigma`, `j`, `shift`, `x0_hat`).
+        shift_in_sigmas: per step, (B,) root-mean-square shift divided by sigma; filled while sampling.
+        j: per step, (B,) J where it was differentiated; filled while sampling.
+    """
+
+    discrepancy: Discrepancy
+    scale: Tensor
+    at: str = "x0"
+    trust_region: float = 1.0
+    callback: Callable[[dict[str, Any]], None] | None = None
+    shift_in_sigmas: list[Tensor] = field(default_factory=list)
+    j: list[Tensor] = field(default_factory=list)
+
+    def shift(self, step: Posterior, timestep: int) -> Tensor:
+        """What to add to x_{k-1}, (B, H, A).
+
+        Two caps make up the trust region. scale * sigma^2 is cut at 1, where the explicit step of the
+        quadratic J lands on the student (beyond 2 it would diverge). Then the step's length is cut at
+        `trust_region` sigmas, so that a guided step stays as likely as a large draw of the teacher's noise.
+        """
+        point = step.x0_hat if self.at == "x0" else step.mean
+        j, grad = gradient(self.discrepancy, point)
+        sigma = step.variance**0.5
+        factor = (self.scale * step.variance).clamp(max=1.0).to(grad)  # (B,)
+        shift = -factor[:, None, None] * grad  # (B, H, A)
+        length = _rms_over_nonzero(shift)  # (B,)
+        cap = (self.trust_region * sigma / length.clamp_min(1e-12)).clamp(max=1.0)
+        shift = shift * cap[:, None, None]
+        if sigma > 0:
+            self.shift_in_sigmas.append(length * cap / sigma)
+            self.j.append(j)
+        if self.callback is not None:
+            self.callback(
+                {"timestep": timestep, "sigma": sigma, "j": j, "shift": shift, "x0_hat": step.x0_hat}
+            )
+        return shift
+
+
+class GuidedScheduler:
+    """A diffusers scheduler whose `step` is shifted by a guide; everything else is the scheduler's."""
+
+    def __init__(self, scheduler: Any, guide: Guide):
+        self._scheduler = scheduler
+        self._guide = guide
+
+    def __getattr__(self, name: str) -> Any:
+        """Defer to the wrapped scheduler."""
+        return getattr(self._scheduler, name)
+
+    def step(self, model_output: Tensor, timestep: int, sample: Tensor, **kwargs: Any) -> Any:
+        """One guided reverse step; the same output object as the wrapped scheduler's."""
+        output = self._scheduler.step(model_output, timestep, sample, **kwargs)
+        step = posterior(
+            self._scheduler, int(timestep), sample, output.pred_original_sample, output.prev_sample
+        )
+        output.prev_sample = output.prev_sample + self._guide.shift(step, int(timestep))
+        return output
+
+
+@contextmanager
+def guided(model: nn.Module, guide: Guide | None) -> Iterator[None]:
+    """Sample from a LeRobot DiffusionModel under a guide; without one, or at scale 0, the model is untouched."""
+    if guide is None or not bool((guide.scale > 0).any()):
+        yield
+        return
+    scheduler = model.noise_scheduler
+    model.noise_scheduler = GuidedScheduler(scheduler, guide)  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        model.noise_scheduler = scheduler
+
+
+def _rms_over_nonzero(shift: Tensor) -> Tensor:
+    """Root mean square of every row over its nonzero entries, (B,): unguided steps do not dilute it."""
+    flat = shift.flatten(1)
+    count = (flat != 0).sum(dim=1).clamp_min(1)
+    return (flat.square().sum(dim=1) / count).sqrt()

@@ -1,0 +1,171 @@
+"""The replay T during training: demonstrations in memory plus the frames of every finished round."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.utils.constants import ACTION
+from torch import Tensor
+
+from lerobot_agpd.replay.frames import FrameTable
+from lerobot_agpd.replay.memory import Batch, FrameMemory, gather_rows
+
+logger = logging.getLogger(__name__)
+
+ROW = "agpd.row"
+"""Batch key of each row's number in T: demonstrations first, under the dataset's own frame index."""
+
+
+class Replay:
+    """T: only ever grows.
+
+    The loader decides which demonstration frames are delivered; a share of them is exchanged for frames of
+    collected episodes. Episodes that the loader never delivers (left out by `--dataset.episodes`, or held out)
+    are never used.
+
+    Args:
+        memory: the demonstrations.
+        config: the student's configuration.
+        collected_share: share of rows exchanged; None draws uniformly from T.
+    """
+
+    def __init__(self, memory: FrameMemory, config: Any, collected_share: float | None):
+        self.memory = memory
+        self.config = config
+        self.collected_share = collected_share
+        self.collected_raw: FrameTable | None = None
+        self.seen_episodes: set[int] = set()
+        self._table: FrameTable | None = None
+        self._sources: list[tuple[int, LeRobotDataset]] = [(0, memory.dataset)]
+        self._action_offsets = torch.arange(config.chunk_size)
+        self._cameras = list(config.image_features)
+
+    # ---- contents ----
+
+    @property
+    def n_demonstration_frames(self) -> int:
+        """Rows of the demonstration dataset, selected or not."""
+        return len(self.memory.table)
+
+    @property
+    def n_collected_frames(self) -> int:
+        """Frames of kept episodes."""
+        return 0 if self.collected_raw is None else len(self.collected_raw)
+
+    @property
+    def table(self) -> FrameTable:
+        """All of T in the student's normalised space."""
+        if self._table is None:
+            self._table = self.memory.normalised
+            if self.collected_raw is not None:
+                device = self._table.episode_start.device
+                self._table = self._table.concatenated(self.memory.normalise(self.collected_raw, device))
+        return self._table
+
+    @property
+    def raw(self) -> FrameTable:
+        """All of T in the environment's units, on the CPU."""
+        if self.collected_raw is None:
+            return self.memory.table
+        return self.memory.table.concatenated(self.collected_raw)
+
+    def add_dataset(self, root: Path) -> None:
+        """Append the episodes of a finished round's dataset."""
+        dataset = LeRobotDataset(f"agpd/{root.parent.name}-{root.name}", root=root)
+        frames = FrameTable.from_dataset(dataset, self.memory.keys)
+        self._sources.append((self.n_demonstration_frames + self.n_collected_frames, dataset))
+        self.collected_raw = frames if self.collected_raw is None else self.collected_raw.concatenated(frames)
+        self._table = None
+
+    # ---- rows ----
+
+    def observe(self, batch: Batch) -> None:
+        """Take note of what the loader delivers in training: its statistics and its episodes."""
+        self.memory.observe(batch)
+        self.seen_episodes.update(batch["episode_index"].tolist())
+
+    def share(self) -> float:
+        """Share of rows that collected frames fill."""
+        if self.n_collected_frames == 0:
+            return 0.0
+        if self.collected_share is not None:
+            return self.collected_share
+        episodes = self.memory.dataset.meta.episodes
+        lengths = torch.as_tensor(episodes["dataset_to_index"]) - torch.as_tensor(
+            episodes["dataset_from_index"]
+        )
+        demonstrated = int(lengths[sorted(self.seen_episodes)].sum())
+        return self.n_collected_frames / (demonstrated + self.n_collected_frames)
+
+    def training_rows(self, batch: Batch, generator: torch.Generator) -> Batch:
+        """Rows of T for a training step: the loader's frames, a share exchanged for collected ones."""
+        rows = batch["index"].clone()
+        exchanged = torch.rand(len(rows), generator=generator) < self.share()
+        n_exchanged = int(exchanged.sum())
+        if n_exchanged:
+            draws = torch.randint(self.n_collected_frames, (n_exchanged,), generator=generator)
+            rows[exchanged.to(rows.device)] = (self.n_demonstration_frames + draws).to(rows)
+        composed = self._gather(batch, rows)
+        for key in self._cameras if n_exchanged else ():
+            composed[key] = batch[key].clone()
+            for position in exchanged.nonzero()[:, 0].tolist():
+                image = self.image(int(rows[position]), key)
+                composed[key][position] = self.memory.normaliser.normalise(key, image).to(batch[key])
+        return composed
+
+    def demonstration_rows(self, batch: Batch) -> Batch:
+        """The loader's frames with their chunks, for a held-out loss."""
+        return self._gather(batch, batch["index"])
+
+    def _gather(self, batch: Batch, rows: Tensor) -> Batch:
+        gathered = gather_rows(self.table, rows, self.config, self._action_offsets, n_obs_steps=1)
+        return {**{key: batch[key] for key in self._cameras}, **gathered, ROW: rows}
+
+    # ---- single frames ----
+
+    def image(self, row: int, key: str) -> Tensor:
+        """A camera's frame (C, H, W) in [0, 1], read from its dataset."""
+        start, dataset = next(source for source in reversed(self._sources) if source[0] <= row)
+        return dataset[row - start][key]
+
+    def history(self, rows: Tensor, keys: Sequence[str], n_obs_steps: int) -> dict[str, Tensor]:
+        """Raw observation histories (B, n_obs_steps, ...) of rows, for a teacher."""
+        raw, offsets = self.raw, torch.arange(1 - n_obs_steps, 1)
+        rows = rows.cpu()
+        histories = {}
+        for key in keys:
+            if key in raw.columns:
+                histories[key] = raw.gather(key, rows, offsets)[0]
+            else:
+                steps = (rows[:, None] + offsets).clamp(min=raw.episode_start[rows, None])  # (B, n_obs)
+                images = [torch.stack([self.image(int(step), key) for step in row]) for row in steps]
+                histories[key] = torch.stack(images)
+        return histories
+
+    def executed_future(
+        self, rows: Tensor, keys: Sequence[str], n_steps: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """What the representation learns from, in the student's normalised space.
+
+        Returns:
+            Observations now (B, D) and n_steps later (B, D), features side by side, and the mask (B,) that is
+            True where the later one lies beyond the episode.
+        """
+        now, later = [], []
+        is_pad = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
+        for key in keys:
+            values, pad = self.table.gather(key, rows, torch.tensor([0, n_steps]))
+            now.append(values[:, 0])
+            later.append(values[:, 1])
+            is_pad = pad[:, 1]
+        return torch.cat(now, dim=1), torch.cat(later, dim=1), is_pad
+
+    @property
+    def vector_keys(self) -> list[str]:
+        """Low-dimensional observation features."""
+        return [key for key in self.memory.keys if key != ACTION]

@@ -1,0 +1,142 @@
+"""`lerobot-agpd-demos`, end to end on FetchReach."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.envs.configs import EnvConfig
+
+from lerobot_agpd.cli import demos
+from lerobot_agpd.cli.demos import DemosConfig, DemosReport, record_demos, successful_episodes
+from lerobot_agpd.envs.experts import fetch_reach_expert
+from lerobot_agpd.envs.gymnasium_robotics import TASKS, GymnasiumRoboticsEnv
+
+pytest.importorskip("gymnasium_robotics")
+
+REACH = "FetchReach-v4"
+
+
+def reach_config(root, **options) -> DemosConfig:
+    return DemosConfig(root=root, env=GymnasiumRoboticsEnv(task=REACH, episode_length=12), **options)
+
+
+def lazy_expert(observation):
+    return np.zeros(4, dtype=np.float32)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> LeRobotDataset:
+    """Two episodes, recorded through the console command."""
+    root = tmp_path_factory.mktemp("demos") / "nested" / "reach"
+    argv = [
+        "lerobot-agpd-demos",
+        "--env.type=gymnasium_robotics",
+        f"--env.task={REACH}",
+        "--env.episode_length=12",
+    ]
+    argv += ["--episodes=2", "--seed=40", f"--root={root}", "--repo_id=local/reach", "--push_to_hub=false"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", argv)
+        demos.main()
+    return LeRobotDataset("local/reach", root=root)
+
+
+def test_dataset_has_the_declared_contents(recorded):
+    assert (recorded.num_episodes, recorded.num_frames, recorded.fps) == (2, 24, 25)
+    assert not list(recorded.root.parent.glob("*.partial"))
+    frame = recorded[11]
+    shapes = {
+        key: tuple(frame[key].shape)
+        for key in ("observation.state", "observation.environment_state", "action")
+    }
+    assert shapes == {"observation.state": (10,), "observation.environment_state": (3,), "action": (4,)}
+    assert frame["next.success"].item() and frame["next.done"].item() and frame["next.reward"].item() == 0
+    assert frame["task"] == TASKS[REACH].description
+    assert [recorded[i]["next.done"].item() for i in range(24)] == ([False] * 11 + [True]) * 2
+    assert recorded[0]["next.reward"].item() == -1 and not recorded[0]["next.success"].item()
+
+
+def test_replayed_actions_repeat_the_episode(recorded):
+    seeds = json.loads((recorded.root / demos.REPORT_PATH).read_text())["seeds"]
+    assert len(seeds) == 2 and seeds[0] >= 40
+    frames = [recorded[i] for i in range(recorded.num_frames)]
+    for episode, seed in enumerate(seeds):
+        env = GymnasiumRoboticsEnv(task=REACH, episode_length=12).make_single()
+        observation, _ = env.reset(seed=seed)
+        for frame in (frame for frame in frames if frame["episode_index"] == episode):
+            np.testing.assert_array_equal(observation["agent_pos"], frame["observation.state"])
+            np.testing.assert_array_equal(
+                observation["environment_state"], frame["observation.environment_state"]
+            )
+            observation, reward, terminated, truncated, info = env.step(frame["action"].numpy())
+            assert info["is_success"] == frame["next.success"].item()
+            assert reward == frame["next.reward"].item()
+            assert (terminated or truncated) == frame["next.done"].item()
+        assert info["is_success"]
+
+
+def test_trivial_starts_and_failures_are_left_out_and_counted(tmp_path):
+    config = reach_config(tmp_path / "x", episodes=40)
+    env = config.env.make_single()
+    trivial = [seed for seed in range(60) if env.reset(seed=seed)[1]["is_success"]]
+    assert trivial, "choose a range of seeds with a trivial start"
+
+    calls = 0
+
+    def expert_that_fails_its_first_episode(observation):
+        nonlocal calls
+        calls += 1
+        return (lazy_expert if calls <= 12 else fetch_reach_expert)(observation)
+
+    report = DemosReport(task=REACH)
+    episodes = list(successful_episodes(env, expert_that_fails_its_first_episode, config, report))
+    assert len(episodes) == len(report.seeds) == 40
+    assert report.trivial_seeds == [seed for seed in trivial if seed <= report.seeds[-1]]
+    assert report.failed_seeds == [next(seed for seed in range(60) if seed not in trivial)]
+    assert sorted(report.seeds + report.trivial_seeds + report.failed_seeds) == list(range(report.attempts))
+    assert report.success_rate == pytest.approx(40 / 41)
+
+
+def test_an_expert_that_never_succeeds_ends_in_an_error_and_leaves_no_dataset(tmp_path, monkeypatch):
+    monkeypatch.setattr(demos, "make_expert", lambda task: lazy_expert)
+    with pytest.raises(RuntimeError, match="Only 0 of 1 episodes succeeded in 10 attempts"):
+        record_demos(reach_config(tmp_path / "x", episodes=1))
+    assert not (tmp_path / "x").exists()
+
+
+def test_leftovers_of_an_interrupted_run_are_replaced(tmp_path):
+    leftover = tmp_path / "x.partial" / "meta" / "old.json"
+    leftover.parent.mkdir(parents=True)
+    leftover.touch()
+    record_demos(reach_config(tmp_path / "x", episodes=1))
+    assert not leftover.exists() and not (tmp_path / "x" / "meta" / "old.json").exists()
+    assert LeRobotDataset("local/demos", root=tmp_path / "x").num_episodes == 1
+
+
+def test_existing_root_is_refused(tmp_path):
+    with pytest.raises(FileExistsError, match="already exists"):
+        reach_config(tmp_path)
+
+
+@pytest.mark.parametrize(("seed", "episodes"), [(100_000, 1), (99_999, 2), (-1, 1)])
+def test_seeds_of_evaluations_are_refused(tmp_path, seed, episodes):
+    with pytest.raises(ValueError, match="evaluations use those from 100000 on"):
+        reach_config(tmp_path / "x", seed=seed, episodes=episodes)
+
+
+def test_seeds_never_run_into_those_of_evaluations(tmp_path, monkeypatch):
+    monkeypatch.setattr(demos, "make_expert", lambda task: lazy_expert)
+    with pytest.raises(RuntimeError, match="next seed 100000"):
+        record_demos(reach_config(tmp_path / "x", seed=99_998, episodes=2))
+
+
+def test_other_requests_that_cannot_work_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="--episodes"):
+        reach_config(tmp_path / "x", episodes=0)
+    with pytest.raises(ValueError, match="pusht"):
+        DemosConfig(root=tmp_path / "x", env=EnvConfig.get_choice_class("pusht")())
+    slide = DemosConfig(root=tmp_path / "x", env=GymnasiumRoboticsEnv(task="FetchSlide-v4"))
+    with pytest.raises(ValueError, match="No scripted expert"):
+        record_demos(slide)
