@@ -1,1 +1,1 @@
-"""Console commands of this plugin."""
+"""Console commands, `lerobot-agpd-*`, one file each."""

@@ -1,0 +1,119 @@
+"""`lerobot-agpd-report`: evaluate runs side by side; a table, a picture and JSON."""
+
+import json
+import logging
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import draccus
+from lerobot.envs import EnvConfig
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.utils import init_logging
+from rich.console import Console
+from rich.table import Table
+
+from lerobot_agpd.analysis.evaluation import Checkpoint, checkpoint_steps
+from lerobot_agpd.analysis.report import HEADER, MethodResult, markdown, plot_curves, table_rows
+from lerobot_agpd.replay.store import ReplayStore
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass
+class ReportConfig:
+    """Options of `lerobot-agpd-report`."""
+
+    env: EnvConfig  # environment to evaluate in
+    output: Path  # folder of report.json, report.md and curves.png
+    runs: dict[str, Path] = field(default_factory=dict)  # name to output folder of a lerobot-train run
+    policies: dict[str, Path] = field(
+        default_factory=dict
+    )  # name to a single checkpoint, such as the teacher
+    episodes: int = 200  # episodes of the final evaluation
+    curve_episodes: int = 0  # episodes at every earlier checkpoint; 0: no learning curve
+    batch_size: int = 50  # environments side by side
+    seed: int = 100_000  # first environment seed; training and collection stay away from 100000 to 999999
+    device: str = "cpu"  # where policies run
+    title: str = ""  # title of the picture
+
+    def __post_init__(self) -> None:
+        if not self.runs and not self.policies:
+            raise ValueError("nothing to report: name runs (--runs='{name: folder}') or --policies")
+        for name, path in {**self.runs, **self.policies}.items():
+            if not Path(path).exists():
+                raise FileNotFoundError(f"'{name}': {path} does not exist")
+
+
+def collected(run: Path) -> list[dict[str, Any]]:
+    """Reports of a run's collection rounds, without the single episodes."""
+    rounds = ReplayStore(run / "agpd").rounds()
+    return [{key: value for key, value in entry.report.items() if key != "episodes"} for entry in rounds]
+
+
+def evaluate_run(name: str, run: Path, config: ReportConfig) -> MethodResult:
+    """Evaluate a run's last checkpoint, and the earlier ones for its learning curve."""
+    steps = checkpoint_steps(run)
+    last = max(steps)
+    curve = {}
+    for step, path in steps.items():
+        if config.curve_episodes and step != last:
+            logger.info("%s, step %d", name, step)
+            checkpoint = Checkpoint(path, config.device)
+            curve[step] = checkpoint.evaluate(
+                config.env, config.curve_episodes, config.batch_size, config.seed
+            )
+    result = evaluate_policy(name, steps[last], config)
+    if curve:
+        result.curve = {**curve, last: result.final}
+    rounds = collected(run)
+    if rounds:
+        keys = ("generated", "successful", "kept")
+        result.collection = {key: sum(entry[key] for entry in rounds) for key in keys} | {"rounds": rounds}
+    return result
+
+
+def evaluate_policy(name: str, path: Path, config: ReportConfig) -> MethodResult:
+    """Evaluate one checkpoint."""
+    logger.info("%s: %d episodes from seed %d", name, config.episodes, config.seed)
+    checkpoint = Checkpoint(path, config.device)
+    final = checkpoint.evaluate(config.env, config.episodes, config.batch_size, config.seed)
+    return MethodResult(name, final, checkpoint.latency())
+
+
+def show(results: list[MethodResult]) -> None:
+    """Print the table."""
+    table = Table(*HEADER)
+    for row in table_rows(results):
+        table.add_row(*row)
+    Console().print(table)
+
+
+@draccus.wrap()
+def run(config: ReportConfig) -> None:
+    """Evaluate, write and show."""
+    results = [evaluate_policy(name, path, config) for name, path in config.policies.items()]
+    results += [evaluate_run(name, path, config) for name, path in config.runs.items()]
+    rounds: list[dict[str, Any]] = next((result.collection["rounds"] for result in results if result.collection), [])
+    config.output.mkdir(parents=True, exist_ok=True)
+    content = {
+        "environment": draccus.encode(config.env, EnvConfig),
+        "first_seed": config.seed,
+        "methods": [result.to_json() for result in results],
+    }
+    (config.output / "report.json").write_text(json.dumps(content, default=str) + "\n")
+    (config.output / "report.md").write_text(markdown(results))
+    plot_curves(results, rounds, config.output / "curves.png", config.title)
+    show(results)
+    logger.info("wrote report.json, report.md and curves.png to %s", config.output)
+
+
+def main() -> None:
+    """Console entry point."""
+    init_logging()
+    register_third_party_plugins()
+    run()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,421 @@
+"""`lerobot-agpd-viz`: watch a teacher being guided toward a student, as a rerun recording."""
+
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import rerun as rr
+import torch
+from gymnasium.vector import VectorEnv, VectorWrapper
+from lerobot.configs import PreTrainedConfig, parser
+from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors
+from lerobot.envs.utils import env_to_policy_features
+from lerobot.policies import get_policy_class, make_pre_post_processors
+from lerobot.processor import NormalizerProcessorStep
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.utils import init_logging
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from lerobot_agpd.analysis.recording import (
+    Array,
+    Chunks,
+    DecisionRecord,
+    RolloutRecord,
+    blueprint,
+    draw_still,
+    layout,
+    log_rollout,
+)
+from lerobot_agpd.cli.demos import FIRST_EVALUATION_SEED
+from lerobot_agpd.collect.rollout import Decision, Rollouts
+from lerobot_agpd.collect.strategies import GuidedTeacher
+from lerobot_agpd.distill.distillation import executed_steps
+from lerobot_agpd.distill.environment import check_environment_fits
+from lerobot_agpd.distill.state import DistillationState, replay_root
+from lerobot_agpd.distill.student import DistilledStudent
+from lerobot_agpd.guidance.alignment import Alignment
+from lerobot_agpd.guidance.config import TeacherConfig
+from lerobot_agpd.guidance.discrepancy import ActionDiscrepancy, Discrepancy, StateDiscrepancy
+from lerobot_agpd.guidance.teacher import check_teacher_fits, load_teacher
+from lerobot_agpd.replay.episode import Episode, Ticket
+from lerobot_agpd.replay.normalisation import Normaliser
+from lerobot_agpd.replay.store import ReplayStore
+from lerobot_agpd.run import RunInfo
+
+logger = logging.getLogger(__name__)
+
+APPLICATION = "lerobot-agpd-viz"
+
+
+@dataclass
+class VizConfig:
+    """Options of `lerobot-agpd-viz`."""
+
+    env: EnvConfig  # environment to act in
+    policy: PreTrainedConfig | None = None  # the student: --policy.path=<checkpoint of a distilled policy>
+    teacher: TeacherConfig = field(default_factory=TeacherConfig)  # what is not set is the checkpoint's
+    episodes: int = 1  # episodes to record
+    seed: int = FIRST_EVALUATION_SEED  # environment seed of the first episode; also seeds the noise
+    scale: float | None = None  # guidance scale; default: that of the run's next round, else the policy's
+    output: Path = Path("outputs/rollout.rrd")  # recording to write
+    png: Path | None = None  # still picture of the first episode to draw
+    render: bool = True  # record rendered frames
+    open: bool = False  # show the recording in a rerun viewer while it is made
+
+    def __post_init__(self) -> None:
+        """Read the checkpoint's configuration and check the options.
+
+        Raises:
+            ValueError: if there is no checkpoint, or a number is out of range.
+        """
+        path = parser.get_path_arg("policy")
+        if path:
+            overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
+            self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+            self.policy.pretrained_path = Path(path)
+        if self.policy is None or not self.policy.pretrained_path:
+            raise ValueError(
+                "--policy.path is not set: name the checkpoint folder of a policy trained with AGPD "
+                "(<output_dir>/checkpoints/last/pretrained_model)"
+            )
+        if not isinstance(getattr(self.policy, "teacher", None), TeacherConfig):
+            raise ValueError(
+                f"--policy.path={self.policy.pretrained_path} is a '{self.policy.type}' policy, which has no "
+                "teacher; name a policy trained with AGPD (type 'agpd' or another distilled one)"
+            )
+        if self.episodes < 1:
+            raise ValueError(f"--episodes must be at least 1, got {self.episodes}")
+        if self.scale is not None and self.scale < 0:
+            raise ValueError(f"--scale must not be negative, got {self.scale}")
+
+    @classmethod
+    def __get_path_fields__(cls) -> list[str]:
+        """Fields whose `.path` the parser leaves to `__post_init__`."""
+        return ["policy"]
+
+
+# ---- student and teacher ----
+
+
+@dataclass(frozen=True)
+class Student:
+    """A trained student with its checkpoint's normalisation."""
+
+    policy: DistilledStudent
+    normaliser: Normaliser
+
+    @property
+    def device(self) -> str:
+        """Where it computes."""
+        return str(self.policy.config.device)
+
+    def propose(self, observation: Mapping[str, Tensor]) -> Tensor:
+        """Its chunk (B, S, A) at raw observations, in its own units."""
+        batch = {
+            key: self.normaliser.normalise(key, observation[key]).to(self.device)
+            for key in self.policy.config.input_features
+        }
+        return self.policy.predict_action_chunk(batch)
+
+    def state_discrepancy(
+        self,
+        alignment: Alignment,
+        observation: Mapping[str, Tensor],
+        chunk_hat: Tensor,
+        action_j: ActionDiscrepancy,
+    ) -> Discrepancy:
+        """J between the futures that its representation predicts."""
+        assert self.policy.representation is not None
+        config = self.policy.config
+        vectors = [key for key in config.input_features if key not in config.image_features]
+        normalised = [self.normaliser.normalise(key, observation[key]) for key in vectors]
+        return StateDiscrepancy(
+            representation=self.policy.representation,
+            observation=torch.cat(normalised, dim=1).to(chunk_hat.device),
+            target=chunk_hat[:, : alignment.n_steps],
+            to_student=alignment.teacher_in_student_units,
+            reference=action_j,
+        )
+
+
+def load_student(config: PreTrainedConfig) -> Student:
+    """Load the checkpoint at `config.pretrained_path`.
+
+    Raises:
+        ValueError: if the policy is not a student of AGPD or its checkpoint has no normaliser.
+    """
+    path = str(config.pretrained_path)
+    policy = get_policy_class(config.type).from_pretrained(path, config=config)
+    if not isinstance(policy, DistilledStudent):
+        raise ValueError(f"--policy.path={path} is a '{config.type}' policy, not a student of AGPD")
+    preprocessor, _ = make_pre_post_processors(
+        config,
+        pretrained_path=path,
+        preprocessor_overrides={"device_processor": {"device": config.device}},
+    )
+    for step in preprocessor.steps:
+        if isinstance(step, NormalizerProcessorStep) and step.stats is not None:
+            return Student(policy.eval(), Normaliser(config, step.stats))
+    raise ValueError(f"the preprocessor in --policy.path={path} holds no statistics to normalise with")
+
+
+def make_guided_teacher(config: VizConfig) -> GuidedTeacher:
+    """The checkpoint's teacher, guided toward its student as during collection.
+
+    Raises:
+        ValueError: if teacher, student and environment do not fit together.
+    """
+    policy_config: Any = config.policy
+    chosen = {key: value for key, value in asdict(config.teacher).items() if value}
+    teacher = load_teacher(replace(policy_config.teacher, **chosen), policy_config.device)
+    check_environment_fits(config.env, policy_config, teacher)
+    check_teacher_fits(teacher, env_to_policy_features(config.env), policy_config.action_feature)
+    student = load_student(policy_config)
+    alignment = Alignment(
+        start=teacher.start,
+        n_steps=executed_steps(policy_config, teacher),
+        teacher_units=teacher.to_units,
+        teacher_raw=teacher.to_raw,
+        student_units=partial(student.normaliser.normalise, "action"),
+        student_raw=partial(student.normaliser.unnormalise, "action"),
+    )
+    learned = student.policy.representation is not None
+    return GuidedTeacher(
+        teacher,
+        student.propose,
+        alignment,
+        policy_config.guidance,
+        torch.Generator(device=policy_config.device).manual_seed(config.seed),
+        partial(student.state_discrepancy, alignment) if learned else None,
+    )
+
+
+def guidance_scale(config: VizConfig) -> float:
+    """`--scale`, else what the checkpoint's run would use in its next round, else where a run starts."""
+    if config.scale is not None:
+        return config.scale
+    policy_config: Any = config.policy
+    start = float(policy_config.guidance.scale)
+    try:
+        state = DistillationState.restore(policy_config, RunInfo(resume=True))
+    except FileNotFoundError:  # a checkpoint from the Hub, or one that never trained
+        return start
+    output_dir = policy_config.pretrained_path.resolve().parents[2]
+    root = replay_root(policy_config.replay, RunInfo(output_dir=output_dir), state)
+    rounds = ReplayStore(root).rounds()[: state.rounds]
+    if len(rounds) < state.rounds:
+        logger.warning("%s holds no manifest of the checkpoint's rounds; the scale is %g", root, start)
+        return start
+    return float(rounds[-1].report["next_scale"]) if rounds else start
+
+
+# ---- recording a rollout ----
+
+
+class DecisionRecorder:
+    """Decides as a guided teacher does, and remembers what the teacher alone and the student would have done.
+
+    Attributes:
+        decisions: of the running episode; the caller takes them and clears the list.
+    """
+
+    def __init__(self, guided: GuidedTeacher):
+        """Record the decisions of `guided`, for one environment."""
+        self.guided = guided
+        self.decisions: list[DecisionRecord] = []
+
+    @property
+    def n_obs_steps(self) -> int:
+        """The teacher's history."""
+        return self.guided.n_obs_steps
+
+    def decide(self, history: Mapping[str, Tensor], scale: Tensor) -> Decision:
+        """The guided decision; the unguided one is drawn first, from the same noise."""
+        noise = self.guided.generator.get_state()
+        alone = self.guided.decide(history, torch.zeros_like(scale))
+        self.guided.generator.set_state(noise)
+        decision = self.guided.decide(history, scale)
+        n_steps = self.guided.alignment.n_steps
+        chunk_hat = self.guided.propose({key: value[:, -1] for key, value in history.items()})
+        student = self.guided.alignment.student_raw(chunk_hat[:, :n_steps])
+        self.decisions.append(
+            DecisionRecord(
+                step=len(self.decisions) * n_steps,
+                chunks=Chunks(_first(alone.actions), _first(decision.actions), _first(student)),
+                j_teacher=float(alone.j[0]),
+                j_guided=float(decision.j[0]),
+                shift_in_sigmas=float(decision.shift[0]),
+            )
+        )
+        return decision
+
+
+class FrameRecorder(VectorWrapper):
+    """Renders the first environment before every step.
+
+    Attributes:
+        frames: of the running episode, (H, W, 3) uint8 each; a reset starts a new list.
+    """
+
+    def __init__(self, env: VectorEnv):
+        """Render `env`."""
+        super().__init__(env)
+        self.frames: list[Array] = []
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset and render."""
+        result = self.env.reset(seed=seed, options=options)
+        self.frames = [self._render()]
+        return result
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step and, unless the episode is over, render."""
+        result = self.env.step(actions)
+        _, _, terminated, truncated, _ = result
+        if not (terminated[0] or truncated[0]):
+            self.frames.append(self._render())
+        return result
+
+    def _render(self) -> Array:
+        try:
+            rendered = self.env.render()
+        except Exception as error:
+            raise RuntimeError(
+                f"rendering failed ({error}). MuJoCo environments need an OpenGL backend: set the environment variable "
+                "MUJOCO_GL=egl (GPU or Mesa) or MUJOCO_GL=osmesa (software); or record without frames: --render=false"
+            ) from error
+        frame = rendered[0] if rendered else None
+        if not isinstance(frame, np.ndarray):
+            raise RuntimeError(
+                "the environment renders no pictures; pass --env.render_mode=rgb_array or --render=false"
+            )
+        return frame
+
+
+def record_rollouts(
+    config: VizConfig, guided: GuidedTeacher, scale: float
+) -> Iterator[tuple[Episode, RolloutRecord]]:
+    """Play the episodes one by one."""
+    tasks = make_env(config.env, n_envs=1)
+    env = next(iter(next(iter(tasks.values())).values()))
+    frames = FrameRecorder(env) if config.render else None
+    recorder = DecisionRecorder(guided)
+    processors = make_env_pre_post_processors(config.env, config.policy)
+    tickets = [Ticket(number, config.seed + number, scale) for number in range(config.episodes)]
+    try:
+        for episode in Rollouts(frames or env, processors, recorder).run(tickets):
+            pictures = frames.frames if frames is not None else []
+            yield (
+                episode,
+                RolloutRecord(
+                    observations=episode.observations,
+                    actions=episode.actions,
+                    rewards=episode.rewards,
+                    successes=episode.successes,
+                    decisions=recorder.decisions,
+                    frames=pictures,
+                    to_frame=plane_to_frame(env.single_action_space, pictures[0] if pictures else None),
+                ),
+            )
+            recorder.decisions = []
+    finally:
+        close_envs(tasks)
+
+
+def plane_to_frame(space: gym.Space, frame: Array | None) -> Callable[[Array], Array] | None:
+    """How to draw two-dimensional actions: their bounds span the frame. None for other action spaces.
+
+    Without a frame they are drawn in their own units.
+    """
+    if not (isinstance(space, gym.spaces.Box) and space.shape == (2,) and space.is_bounded()):
+        return None
+    if frame is None:
+        return lambda actions: actions
+    size = np.array([frame.shape[1], frame.shape[0]])
+    return lambda actions: (actions - space.low) / (space.high - space.low) * size
+
+
+def _first(chunks: Tensor) -> Array:
+    return chunks[0].float().cpu().numpy()
+
+
+# ---- the command ----
+
+
+def visualise(config: VizConfig) -> Table:
+    """Record the rollouts, and draw the still if one is wanted.
+
+    Returns:
+        A summary with one row per episode.
+    """
+    scale = guidance_scale(config)
+    if scale == 0:
+        logger.warning("the guidance scale is 0, so the guided teacher equals the teacher alone")
+    guided = make_guided_teacher(config)
+    table = Table("seed", "steps", "max reward", "success", "J alone", "J guided", title=f"scale {scale:g}")
+    layouts = []
+    with _recording(config) as stream:
+        for number, (episode, rollout) in enumerate(record_rollouts(config, guided, scale)):
+            root = f"episode_{number}"
+            log_rollout(stream, root, rollout)
+            layouts.append(layout(root, rollout))
+            stream.send_blueprint(blueprint(layouts))
+            table.add_row(*_row(episode, rollout))
+            if config.png is not None and number == 0:
+                config.png.parent.mkdir(parents=True, exist_ok=True)
+                draw_still(rollout, config.png)
+    return table
+
+
+def _recording(config: VizConfig) -> rr.RecordingStream:
+    """A stream into the output file and, if wanted, a viewer."""
+    config.output.parent.mkdir(parents=True, exist_ok=True)
+    stream = rr.RecordingStream(APPLICATION)
+    sinks: list[Any] = [rr.FileSink(config.output)]
+    if config.open:
+        rr.spawn(connect=False)
+        sinks.append(rr.GrpcSink())
+    stream.set_sinks(*sinks)
+    return stream
+
+
+def _row(episode: Episode, rollout: RolloutRecord) -> tuple[str, ...]:
+    success = "-" if episode.success is None else str(episode.success)
+    alone = np.mean([decision.j_teacher for decision in rollout.decisions])
+    guided = np.mean([decision.j_guided for decision in rollout.decisions])
+    return (
+        str(episode.ticket.seed),
+        str(len(episode)),
+        f"{episode.max_reward:.3f}",
+        success,
+        f"{alone:.3g}",
+        f"{guided:.3g}",
+    )
+
+
+@parser.wrap()
+def run(config: VizConfig) -> None:
+    """Record and report."""
+    table = visualise(config)
+    Console().print(table)
+    logger.info("recording in %s (open it with `rerun %s`)", config.output, config.output)
+    if config.png is not None:
+        logger.info("still picture in %s", config.png)
+
+
+def main() -> None:
+    """Console entry point."""
+    init_logging()
+    register_third_party_plugins()
+    run()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,120 @@
+import pytest
+import torch
+
+from lerobot_agpd.guidance.config import RepresentationConfig
+from lerobot_agpd.guidance.discrepancy import ActionDiscrepancy, StateDiscrepancy, gradient
+from lerobot_agpd.guidance.representation import StateRepresentation, reconstruction_loss
+
+B, H, N, A, D, START = 3, 6, 2, 2, 4, 1
+
+
+def student_units(actions):
+    return 3 * actions + 0.5
+
+
+@pytest.fixture
+def state_j():
+    config = RepresentationConfig(type="state", width=16, n_layers=1, n_heads=2, latent_dim=4)
+    target = torch.randn(B, N, A)
+    return StateDiscrepancy(
+        representation=StateRepresentation(D, A, N, config),
+        observation=torch.randn(B, D),
+        target=student_units(target),
+        to_student=student_units,
+        reference=ActionDiscrepancy(target, START),
+    )
+
+
+def test_action_discrepancy_by_hand():
+    target = torch.tensor([[[1.0, 2.0], [0.0, -1.0]]])
+    chunk = torch.tensor([[[9.0, 9.0], [2.0, 2.0], [3.0, 1.0], [9.0, 9.0]]])
+    j, grad = gradient(ActionDiscrepancy(target, start=1), chunk)
+    assert j.tolist() == [7.0]  # (1 + 0 + 9 + 4) / 2
+    assert grad.tolist() == [[[0, 0], [1, 0], [3, 2], [0, 0]]]
+
+
+def test_rows_do_not_mix():
+    chunk = torch.randn(B, H, A)
+    j, grad = gradient(ActionDiscrepancy(torch.zeros(B, N, A), START), chunk)
+    executed = chunk[:, START : START + N]
+    torch.testing.assert_close(j, 0.5 * executed.square().sum(dim=(1, 2)))
+    torch.testing.assert_close(grad[:, START : START + N], executed)
+    assert (grad[:, START + N :] == 0).all() and (grad[:, :START] == 0).all()
+
+
+def test_gradient_works_under_no_grad_and_leaves_the_chunk_alone():
+    chunk = torch.randn(B, H, A)
+    with torch.no_grad():
+        j, grad = gradient(ActionDiscrepancy(torch.zeros(B, N, A), START), chunk)
+    assert not (j.requires_grad or grad.requires_grad or chunk.requires_grad)
+    assert grad.abs().sum() > 0
+
+
+def test_state_discrepancy_by_hand(state_j):
+    """Up to its constant factor, J is the squared distance of the two predicted observations."""
+    chunk = torch.randn(B, H, A)
+    executed = student_units(chunk[:, START : START + N])
+    gap = state_j.representation(state_j.observation, executed) - state_j.representation(
+        state_j.observation, state_j.target
+    )
+    ratio = gradient(state_j, chunk)[0] / gap.square().sum(dim=1)
+    torch.testing.assert_close(ratio, ratio[:1].expand(B))
+    assert ratio[0] > 0
+
+
+def test_state_discrepancy_has_the_action_gradients_mean_norm(state_j):
+    chunk = torch.randn(B, H, A)
+    with torch.no_grad():
+        grad = gradient(state_j, chunk)[1]
+        reference = gradient(state_j.reference, chunk)[1]
+    norms = grad.flatten(1).norm(dim=1)
+    torch.testing.assert_close(norms.mean(), reference.flatten(1).norm(dim=1).mean())
+    assert norms.std() > 1e-4  # one factor for the batch, not one per row
+    assert (grad[:, :START] == 0).all() and (grad[:, START + N :] == 0).all()
+
+
+def test_state_discrepancy_descends(state_j):
+    chunk = torch.randn(B, H, A)
+    state_j.representation.double()
+    chunk = chunk.double()
+    state_j = StateDiscrepancy(
+        state_j.representation,
+        state_j.observation.double(),
+        state_j.target.double(),
+        student_units,
+        ActionDiscrepancy(state_j.reference.target.double(), START),
+    )
+    j, grad = gradient(state_j, chunk)
+    unit = gradient(state_j, chunk)[0] / state_j(chunk)  # the factor of this chunk
+    assert (state_j(chunk - 1e-5 * grad) * unit < j).all()
+
+
+def test_equal_chunks_have_no_discrepancy(state_j):
+    chunk = torch.randn(B, H, A)
+    chunk[:, START : START + N] = state_j.reference.target
+    for discrepancy in (state_j, state_j.reference):
+        j, grad = gradient(discrepancy, chunk)
+        assert (j == 0).all() and (grad == 0).all()
+
+
+def test_representation_gets_no_gradient(state_j):
+    gradient(state_j, torch.randn(B, H, A))
+    assert all(parameter.grad is None for parameter in state_j.representation.parameters())
+
+
+def test_reconstruction_loss_ignores_padded_futures():
+    predicted = torch.tensor([[1.0, 3.0], [0.0, 0.0], [2.0, 2.0]])
+    future = torch.tensor([[0.0, 0.0], [100.0, 100.0], [2.0, 0.0]])
+    loss = reconstruction_loss(predicted, future, torch.tensor([False, True, False]))
+    assert loss.item() == pytest.approx((5 + 2) / 2)
+    assert reconstruction_loss(predicted, future, torch.ones(3, dtype=torch.bool)).item() == 0
+
+
+def test_representation_predicts_a_change_and_sees_every_step():
+    config = RepresentationConfig(type="state", width=16, n_layers=1, n_heads=2, latent_dim=4)
+    model = StateRepresentation(D, A, N, config)
+    observation, actions = torch.randn(B, D), torch.randn(B, N, A, requires_grad=True)
+    predicted = model(observation, actions)
+    torch.testing.assert_close(predicted - observation, model.decoder(model.encode(observation, actions)))
+    predicted.sum().backward()
+    assert (actions.grad.abs().sum(dim=2) > 0).all()
