@@ -67,7 +67,10 @@ def test_property_there_and_back_is_identity(case):
     back = alignment.teacher_in_student_units(there)
     torch.testing.assert_close(back, chunk[:, : alignment.n_steps], rtol=1e-4, atol=1e-2)
     torch.testing.assert_close(
-        alignment.teacher_raw(there), alignment.student_raw(chunk[:, : alignment.n_steps]), rtol=1e-5, atol=1e-4
+        alignment.teacher_raw(there),
+        alignment.student_raw(chunk[:, : alignment.n_steps]),
+        rtol=1e-5,
+        atol=1e-4,
     )
 
 
@@ -83,7 +86,9 @@ def test_property_step_k_meets_step_n_obs_minus_1_plus_k(case):
     for k in range(alignment.n_steps):  # the teacher plans the same raw actions at the same moments
         raw = alignment.student_raw(student[:, k])
         chunk[:, alignment.start + k] = alignment.teacher_units(raw)
-    torch.testing.assert_close(j(chunk), torch.zeros(1), rtol=0, atol=1e-5 * (1 + float(target.square().sum())))
+    torch.testing.assert_close(
+        j(chunk), torch.zeros(1), rtol=0, atol=1e-5 * (1 + float(target.square().sum()))
+    )
     for k in range(alignment.n_steps):
         disturbed = chunk.clone()
         disturbed[:, alignment.start + k] += 1.0

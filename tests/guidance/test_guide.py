@@ -175,8 +175,8 @@ def test_guided_chain_equals_its_linear_gaussian_recursion(kind, n_steps, scale,
     x = sample(model, guide_toward(target, [scale] * n, at), n, seed=5)[..., 0]
     for entry, k in ((0, 0.0), (1, scale)):  # entry 0 lies outside the executed window
         m, v = closed_form(kind, n_steps, at, k, mean, std, target)
-        assert x[:, entry].mean().item() == pytest.approx(m, abs=4 * math.sqrt(v / n))
-        assert x[:, entry].var().item() == pytest.approx(v, rel=4 * math.sqrt(2 / n))
+        assert x[:, entry].mean().item() == pytest.approx(m, abs=4 * math.sqrt(v / n) + 1e-5)
+        assert x[:, entry].var().item() == pytest.approx(v, rel=4 * math.sqrt(2 / n), abs=1e-9)
 
 
 @pytest.mark.parametrize(("at", "mean", "variance"), [("mu", 0.058, 0.066), ("x0", 0.090, 0.077)])

@@ -24,6 +24,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
@@ -228,67 +230,73 @@ def _log_images(stream: rr.RecordingStream, path: str, images: Sequence[Array] |
 
 
 def draw_still(rollout: RolloutRecord, path: Path) -> None:
-    """Draw the chunks of the decision in the middle of a rollout, and J over all of it.
+    """Draw the chunks of one decision, and J over the whole rollout.
 
-    The chunks lie on the rendered frame where actions are positions in it, else each action dimension gets a plot.
+    The decision is the one of the rollout's middle half at which teacher and student disagree most. Its chunks lie
+    on the rendered frame where actions are positions in it, else each action dimension gets a plot.
     """
-    decision = rollout.decisions[len(rollout.decisions) // 2]
-    on_frame = rollout.to_frame is not None
-    n_dims = 0 if on_frame else rollout.actions.shape[1]
-    n_columns = 1 if n_dims < 2 else 2 if n_dims <= 8 else 4
-    n_rows = max(-(-n_dims // n_columns), 1)
-    figure = Figure(
-        figsize=(5.5 + 3.2 * n_columns, max(5.5, 1.8 * n_rows + 2)), layout="constrained", dpi=120
-    )
-    left, right = np.asarray(figure.subfigures(1, 2, width_ratios=[5.5, 3.2 * n_columns]))
-    if n_dims:
-        picture, axes_j = left.subplots(2, 1, height_ratios=[3, 2])
-        grid = right.subplots(n_rows, n_columns, sharex=True, squeeze=False).ravel()
-        _plot_dimensions(grid, decision, n_dims)
-        for axes in grid[max(0, n_dims - n_columns) : n_dims]:
-            axes.set_xlabel("step")
-            axes.tick_params(labelbottom=True)
-    else:
-        picture = left.subplots()
-        axes_j, axes_reward = right.subplots(2, 1)
-        axes_reward.plot(rollout.rewards, color="black")
-        axes_reward.set(title="Reward", xlabel="step")
-        axes_reward.axvline(decision.step, color="gray", linestyle=":")
-    _show_frame(picture, rollout, decision)
-    _plot_j(axes_j, rollout.decisions, decision)
-    names = [name for name, _ in decision.chunks.items()]
-    handles = [Axes.plot(axes_j, [], [], color=_rgb(name), label=LABELS[name])[0] for name in names]
+    n_decisions = len(rollout.decisions)
+    middle = rollout.decisions[n_decisions // 4 : n_decisions - n_decisions // 4]
+    decision = max(middle, key=lambda candidate: candidate.j_teacher)
+    draw = _draw_dimensions if rollout.to_frame is None else _draw_on_frame
+    figure = draw(rollout, decision)
+    handles = [Line2D([], [], color=_rgb(name), marker=".", label=LABELS[name]) for name in COLORS]
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False)
     figure.savefig(path)
 
 
-def _show_frame(axes: Axes, rollout: RolloutRecord, decision: DecisionRecord) -> None:
-    axes.set_title(f"Chunks decided at step {decision.step}" if rollout.to_frame else f"Step {decision.step}")
-    axes.set_axis_off()
+def _draw_on_frame(rollout: RolloutRecord, decision: DecisionRecord) -> Figure:
+    """The frame with the chunks on it, the part of it around them, and J."""
+    assert rollout.to_frame is not None
+    chunks = {name: rollout.to_frame(chunk) for name, chunk in decision.chunks.items()}
+    figure = Figure(figsize=(11, 6.5), layout="constrained", dpi=120)
+    panels = figure.subplot_mosaic([["frame", "closer"], ["frame", "j"]], width_ratios=[3, 2])
+    for axes in (panels["frame"], panels["closer"]):
+        if len(rollout.frames):
+            axes.imshow(rollout.frames[decision.step])
+        axes.set(aspect="equal", xticks=[], yticks=[])
+        for name, chunk in chunks.items():
+            axes.plot(*chunk.T, ".-", color=_rgb(name), linewidth=2, markersize=7)
+            axes.plot(*chunk[0], "o", color=_rgb(name), markersize=9, markeredgecolor="white")
+    points = np.concatenate(list(chunks.values()))
+    centre, reach = (points.min(axis=0) + points.max(axis=0)) / 2, 0.7 * np.ptp(points, axis=0).max() + 1e-3
+    x, y = centre - reach
+    panels["closer"].set(xlim=(x, x + 2 * reach), ylim=(y + 2 * reach, y), title="closer")
+    panels["frame"].add_patch(
+        Rectangle((x, y), 2 * reach, 2 * reach, fill=False, color="gray", linestyle=":")
+    )
+    if not len(rollout.frames):
+        panels["frame"].invert_yaxis()
+    panels["frame"].set_title(f"Chunks decided at step {decision.step} (from the large dots on)")
+    _plot_j(panels["j"], rollout.decisions, decision)
+    return figure
+
+
+def _draw_dimensions(rollout: RolloutRecord, decision: DecisionRecord) -> Figure:
+    """A plot per action dimension, J, and the frame if there is one."""
+    n_dims = rollout.actions.shape[1]
+    n_columns = 1 if n_dims < 2 else 2 if n_dims <= 8 else 4
+    n_rows = -(-n_dims // n_columns)
+    figure = Figure(figsize=(5 + 3.2 * n_columns, max(6, 1.8 * n_rows)), layout="constrained", dpi=120)
+    left, right = np.asarray(figure.subfigures(1, 2, width_ratios=[5, 3.2 * n_columns]))
+    grid = right.subplots(n_rows, n_columns, squeeze=False).ravel()
+    for dim, axes in enumerate(grid[:n_dims]):
+        for name, chunk in decision.chunks.items():
+            axes.plot(decision.step + np.arange(len(chunk)), chunk[:, dim], ".-", color=_rgb(name))
+        axes.set_title(f"action {dim}", fontsize="medium")
+        if dim >= n_dims - n_columns:
+            axes.set_xlabel("step")
+    for axes in grid[n_dims:]:
+        axes.set_axis_off()
     if len(rollout.frames):
-        axes.imshow(rollout.frames[decision.step])
-    elif rollout.to_frame is None:
-        axes.text(0.5, 0.5, "not rendered", ha="center", va="center", color="gray")
+        picture, axes_j = left.subplots(2, 1, height_ratios=[2, 1])
+        picture.imshow(rollout.frames[decision.step])
+        picture.set_title(f"step {decision.step}")
+        picture.set_axis_off()
     else:
-        axes.set_axis_on()
-        axes.set_aspect("equal")
-        axes.invert_yaxis()
-    if rollout.to_frame is not None:
-        for name, chunk in decision.chunks.items():
-            x, y = rollout.to_frame(chunk).T
-            axes.plot(x, y, ".-", color=_rgb(name), linewidth=1.8, markersize=5)
-            axes.plot(x[0], y[0], "o", color=_rgb(name), markersize=8, markeredgecolor="white")
-
-
-def _plot_dimensions(grid: Sequence[Axes], decision: DecisionRecord, n_dims: int) -> None:
-    for dim, axes in enumerate(grid):
-        if dim >= n_dims:
-            axes.set_axis_off()
-            continue
-        for name, chunk in decision.chunks.items():
-            steps = decision.step + np.arange(len(chunk))
-            axes.plot(steps, chunk[:, dim], ".-", color=_rgb(name))
-        axes.set_title(f"Action {dim}", fontsize="medium")
+        axes_j = left.subplots()
+    _plot_j(axes_j, rollout.decisions, decision)
+    return figure
 
 
 def _plot_j(axes: Axes, decisions: Sequence[DecisionRecord], shown: DecisionRecord) -> None:
@@ -296,9 +304,10 @@ def _plot_j(axes: Axes, decisions: Sequence[DecisionRecord], shown: DecisionReco
     axes.plot(steps, [d.j_teacher for d in decisions], ".-", color=_rgb("teacher"))
     axes.plot(steps, [d.j_guided for d in decisions], ".-", color=_rgb("guided"))
     axes.axvline(shown.step, color="gray", linestyle=":")
-    axes.set(title="Discrepancy J to the student's chunk", xlabel="step")
+    axes.set(title="J to the student's chunk", xlabel="step")
     axes.set_ylim(bottom=0)
 
 
-def _rgb(name: str) -> tuple[float, ...]:
-    return tuple(channel / 255 for channel in COLORS[name])
+def _rgb(name: str) -> tuple[float, float, float]:
+    red, green, blue = COLORS[name]
+    return red / 255, green / 255, blue / 255

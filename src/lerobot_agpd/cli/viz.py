@@ -1,6 +1,8 @@
 """`lerobot-agpd-viz`: watch a teacher being guided toward a student, as a rerun recording."""
 
 import logging
+import subprocess
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -67,7 +69,7 @@ class VizConfig:
     output: Path = Path("outputs/rollout.rrd")  # recording to write
     png: Path | None = None  # still picture of the first episode to draw
     render: bool = True  # record rendered frames
-    open: bool = False  # show the recording in a rerun viewer while it is made
+    open: bool = False  # show the finished recording in a rerun viewer
 
     def __post_init__(self) -> None:
         """Read the checkpoint's configuration and check the options.
@@ -361,7 +363,9 @@ def visualise(config: VizConfig) -> Table:
     guided = make_guided_teacher(config)
     table = Table("seed", "steps", "max reward", "success", "J alone", "J guided", title=f"scale {scale:g}")
     layouts = []
-    with _recording(config) as stream:
+    config.output.parent.mkdir(parents=True, exist_ok=True)
+    with rr.RecordingStream(APPLICATION) as stream:
+        stream.save(config.output)
         for number, (episode, rollout) in enumerate(record_rollouts(config, guided, scale)):
             root = f"episode_{number}"
             log_rollout(stream, root, rollout)
@@ -372,18 +376,6 @@ def visualise(config: VizConfig) -> Table:
                 config.png.parent.mkdir(parents=True, exist_ok=True)
                 draw_still(rollout, config.png)
     return table
-
-
-def _recording(config: VizConfig) -> rr.RecordingStream:
-    """A stream into the output file and, if wanted, a viewer."""
-    config.output.parent.mkdir(parents=True, exist_ok=True)
-    stream = rr.RecordingStream(APPLICATION)
-    sinks: list[Any] = [rr.FileSink(config.output)]
-    if config.open:
-        rr.spawn(connect=False)
-        sinks.append(rr.GrpcSink())
-    stream.set_sinks(*sinks)
-    return stream
 
 
 def _row(episode: Episode, rollout: RolloutRecord) -> tuple[str, ...]:
@@ -408,6 +400,8 @@ def run(config: VizConfig) -> None:
     logger.info("recording in %s (open it with `rerun %s`)", config.output, config.output)
     if config.png is not None:
         logger.info("still picture in %s", config.png)
+    if config.open:  # in a process of its own, which outlives this one
+        subprocess.Popen([sys.executable, "-m", "rerun", str(config.output)], start_new_session=True)
 
 
 def main() -> None:

@@ -1,0 +1,167 @@
+"""Train, kill, resume, evaluate and export on FetchReach, through LeRobot's own commands."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+from commands import BIN, REACH, TINY_STUDENT, dataset_flags, environment, run, start
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from safetensors import safe_open
+
+pytestmark = pytest.mark.slow
+
+COLLECT = [
+    "--policy.collect.warmup=20",
+    "--policy.collect.every=20",
+    "--policy.collect.episodes=12",
+    "--policy.collect.n_envs=2",
+    "--policy.adversary.start=5",
+    "--steps=60",
+    "--save_freq=20",
+]
+
+
+def records(path: Path) -> list[dict]:
+    """Complete lines of a spool."""
+    if not path.exists():
+        return []
+    return [json.loads(line) for line in path.read_text().split("\n")[:-1]]
+
+
+def test_killed_run_is_resumed_evaluated_and_exported(
+    reach_demos: Path, reach_teacher: Path, tmp_path: Path
+) -> None:
+    teacher = tmp_path / "teacher"
+    shutil.copytree(reach_teacher, teacher)
+    first = tmp_path / "first"
+    process = start(
+        "lerobot-train",
+        *TINY_STUDENT,
+        *REACH,
+        *COLLECT,
+        *dataset_flags(reach_demos),
+        f"--policy.teacher.path={teacher}",
+        "--policy.representation.type=state",
+        "--policy.representation.width=16",
+        f"--output_dir={first}",
+        log=tmp_path / "first.log",
+    )
+    spool = first / "agpd" / "round-001.partial" / "spool-0.jsonl"
+    deadline = time.monotonic() + 600
+    while len(records(spool)) < 3:
+        assert process.poll() is None, (tmp_path / "first.log").read_text()[-5000:]
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    spooled = records(spool)
+    assert 3 <= len(spooled) < 12, "killed in the middle of a round"
+
+    moved = tmp_path / "moved"
+    first.rename(moved)
+    config = moved / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
+    run("lerobot-train", f"--config_path={config}", "--resume=true", f"--output_dir={moved}")
+
+    manifest = json.loads((moved / "agpd" / "manifest.json").read_text())["rounds"]
+    assert [entry["round"] for entry in manifest] == [0, 1], (
+        "one round at 20, one at 40, none at the last step"
+    )
+    report = json.loads((moved / "agpd" / "round-001" / "round.json").read_text())
+    assert report["generated"] == 12
+    by_number = {record["number"]: record for record in report["episodes"]}
+    assert [by_number[record["number"]] for record in spooled] == spooled, (
+        "spooled episodes are not collected again"
+    )
+    assert sum(entry["kept"] for entry in manifest) > 0
+
+    merged = LeRobotDataset("local/merged", root=moved / "agpd" / "merged")
+    assert merged.num_episodes == sum(entry["kept"] for entry in manifest)
+    assert {"agpd.round", "agpd.scale", "agpd.strategy"} <= set(merged.features)
+
+    checkpoint = moved / "checkpoints" / "000060" / "pretrained_model"
+    state = json.loads((checkpoint / "agpd_state.json").read_text())
+    assert (state["updates"], state["rounds"]) == (60, 2)
+    with safe_open(checkpoint / "model.safetensors", "pt") as weights:
+        assert {key.split(".")[0] for key in weights.keys()} == {"model", "discriminator", "representation"}  # noqa: SIM118
+    assert json.loads((checkpoint / "config.json").read_text())["collect"]["env"] is None
+
+    shutil.rmtree(teacher)
+    run(
+        "lerobot-eval",
+        f"--policy.path={checkpoint}",
+        "--policy.device=cpu",
+        *REACH,
+        "--eval.n_episodes=2",
+        "--eval.batch_size=2",
+        "--eval.use_async_envs=true",
+        f"--output_dir={tmp_path / 'eval'}",
+    )
+    assert json.loads((tmp_path / "eval" / "eval_info.json").read_text())["overall"]["n_episodes"] == 2
+
+    act = tmp_path / "act"
+    run("lerobot-agpd-export", f"--checkpoint={checkpoint}", f"--output={act}")
+    load = (
+        "import sys, torch\n"
+        "from lerobot.policies.act.modeling_act import ACTPolicy\n"
+        f"policy = ACTPolicy.from_pretrained({str(act)!r}, strict=True)\n"
+        "batch = {'observation.state': torch.ones(1, 10), 'observation.environment_state': torch.ones(1, 3)}\n"
+        "assert policy.select_action(batch).shape == (1, 4)\n"
+        "assert not any(name.startswith('lerobot_agpd') for name in sys.modules)\n"
+    )
+    subprocess.run([BIN / "python", "-c", load], check=True, env=environment())
+
+
+def test_two_processes_share_a_round(reach_demos: Path, reach_teacher: Path, tmp_path: Path) -> None:
+    output = tmp_path / "run"
+    run(
+        "torchrun",
+        "--standalone",
+        "--nproc_per_node=2",
+        "-m",
+        "lerobot.scripts.lerobot_train",
+        *TINY_STUDENT,
+        *REACH,
+        *dataset_flags(reach_demos),
+        f"--policy.teacher.path={reach_teacher}",
+        "--policy.collect.warmup=5",
+        "--policy.collect.every=5",
+        "--policy.collect.rounds=1",
+        "--policy.collect.episodes=7",
+        "--policy.adversary.start=2",
+        "--steps=10",
+        f"--output_dir={output}",
+    )
+    report = json.loads((output / "agpd" / "round-000" / "round.json").read_text())
+    assert report["generated"] == 7
+    assert len({record["seed"] for record in report["episodes"]}) == 7, "each process has its own seeds"
+    assert [record["number"] for record in report["episodes"]] == [0, 1, 2, 3, 0, 1, 2]
+    kept = [
+        LeRobotDataset("x", root=path).num_episodes for path in (output / "agpd" / "round-000").glob("rank-*")
+    ]
+    assert sum(kept) == report["kept"] > 0
+
+
+def test_a_run_without_any_success_goes_on_cloning(
+    reach_demos: Path, reach_teacher: Path, tmp_path: Path
+) -> None:
+    output = run(
+        "lerobot-train",
+        *TINY_STUDENT,
+        *REACH,
+        *COLLECT,
+        *dataset_flags(reach_demos),
+        f"--policy.teacher.path={reach_teacher}",
+        "--policy.collect.min_reward=1",  # Fetch pays at most 0
+        "--policy.collect.episodes=3",
+        f"--output_dir={tmp_path / 'run'}",
+    )
+    assert "round 1 kept no episode" in output
+    assert "--policy.collect.min_reward" in output
+    manifest = json.loads((tmp_path / "run" / "agpd" / "manifest.json").read_text())["rounds"]
+    assert [(entry["generated"], entry["kept"], entry["datasets"]) for entry in manifest] == [(3, 0, [])] * 2
+    assert (tmp_path / "run" / "checkpoints" / "000060").is_dir()

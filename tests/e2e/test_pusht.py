@@ -1,0 +1,131 @@
+"""Push-T: asynchronous evaluation, and distillation from pixels."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import TINY_STUDENT, TINY_TEACHER, dataset_flags, run
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.envs import make_env
+from lerobot.envs.configs import PushtEnv
+
+pytestmark = pytest.mark.slow
+
+N_STEPS = 30
+PIXELS = ["--env.type=pusht", "--env.obs_type=pixels_agent_pos", f"--env.episode_length={N_STEPS}"]
+
+
+def push(agent: np.ndarray, block: np.ndarray) -> np.ndarray:
+    """An action that shoves the block toward the goal: aim through it from behind."""
+    goal = np.array([256.0, 256.0])
+    away = (block - goal) / (np.linalg.norm(block - goal) + 1e-6)
+    behind = block + 60 * away
+    return goal if np.linalg.norm(agent - behind) < 40 else behind
+
+
+def record(root: Path, pixels: bool) -> Path:
+    """A few clumsy episodes of pushing, recorded in the real environment."""
+    env = PushtEnv(obs_type="pixels_agent_pos" if pixels else "environment_state_agent_pos")
+    envs = make_env(env, n_envs=1)["pusht"][0]
+    vector = {"dtype": "float32", "names": None}
+    features: dict = {"observation.state": {**vector, "shape": (2,)}, "action": {**vector, "shape": (2,)}}
+    if pixels:
+        names = ["height", "width", "channel"]
+        features["observation.image"] = {"dtype": "image", "shape": (96, 96, 3), "names": names}
+    else:
+        features["observation.environment_state"] = {**vector, "shape": (16,)}
+    dataset = LeRobotDataset.create("local/test", fps=10, features=features, root=root, use_videos=False)
+    for episode in range(4):
+        observation, info = envs.reset(seed=[episode])
+        for _ in range(N_STEPS):
+            block = info["block_pose"][0][:2]
+            action = push(observation["agent_pos"][0], block).astype(np.float32)
+            frame = {"observation.state": observation["agent_pos"][0].astype(np.float32), "action": action}
+            if pixels:
+                frame["observation.image"] = observation["pixels"][0]
+            else:
+                frame["observation.environment_state"] = observation["environment_state"][0].astype(
+                    np.float32
+                )
+            dataset.add_frame({**frame, "task": "push"})
+            observation, *_, info = envs.step(action[None])
+        dataset.save_episode()
+    dataset.finalize()
+    envs.close()
+    return root
+
+
+def test_cloning_and_asynchronous_evaluation(tmp_path: Path) -> None:
+    """LeRobot's forkserver workers know gym_pusht only because the plugin preloads it."""
+    demos = record(tmp_path / "demos", pixels=False)
+    run(
+        "lerobot-train",
+        *TINY_STUDENT,
+        *dataset_flags(demos),
+        "--policy.collect.every=0",
+        "--policy.adversary.weight=0",
+        "--dataset.eval_split=0.25",
+        "--eval_steps=5",
+        "--steps=10",
+        f"--output_dir={tmp_path / 'run'}",
+    )
+    run(
+        "lerobot-eval",
+        f"--policy.path={tmp_path / 'run' / 'checkpoints' / 'last' / 'pretrained_model'}",
+        "--policy.device=cpu",
+        "--env.type=pusht",
+        "--env.obs_type=environment_state_agent_pos",
+        "--env.episode_length=10",
+        "--eval.batch_size=2",
+        "--eval.n_episodes=2",
+        "--eval.use_async_envs=true",
+        f"--output_dir={tmp_path / 'eval'}",
+    )
+    assert json.loads((tmp_path / "eval" / "eval_info.json").read_text())["overall"]["n_episodes"] == 2
+
+
+def test_distillation_from_pixels(tmp_path: Path) -> None:
+    """Images come from the loader for demonstrations and from the rounds' datasets for collected frames."""
+    demos = record(tmp_path / "demos", pixels=True)
+    network = ["--policy.pretrained_backbone_weights=null", "--dataset.use_imagenet_stats=false"]
+    teacher = tmp_path / "teacher"
+    run(
+        "lerobot-train",
+        *TINY_TEACHER,
+        *network,
+        "--policy.in_memory=false",
+        "--policy.crop_shape=[84,84]",
+        "--policy.use_group_norm=true",
+        "--batch_size=8",
+        "--policy.noise_samples_per_frame=1",
+        *dataset_flags(demos),
+        "--steps=15",
+        f"--output_dir={teacher}",
+    )
+    output = tmp_path / "run"
+    printed = run(
+        "lerobot-train",
+        *TINY_STUDENT,
+        *network,
+        *PIXELS,
+        *dataset_flags(demos),
+        f"--policy.teacher.path={teacher / 'checkpoints' / 'last' / 'pretrained_model'}",
+        "--policy.collect.warmup=3",
+        "--policy.collect.every=10",
+        "--policy.collect.rounds=1",
+        "--policy.collect.episodes=10",
+        "--policy.collect.min_reward=0.4",
+        "--policy.replay.collected_share=0.5",
+        "--policy.adversary.start=2",
+        "--batch_size=8",
+        "--log_freq=1",
+        "--steps=6",
+        f"--output_dir={output}",
+    )
+    report = json.loads((output / "agpd" / "round-000" / "round.json").read_text())
+    assert report["generated"] == 10
+    assert report["kept"] > 0, [record["max_reward"] for record in report["episodes"]]
+    collected = LeRobotDataset("x", root=output / "agpd" / "round-000" / "rank-0")
+    assert collected[0]["observation.image"].shape == (3, 96, 96)
+    assert "collected_share:0.500" in printed

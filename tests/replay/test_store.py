@@ -1,0 +1,282 @@
+"""Collected episodes on disk: interrupted, continued, finished, merged."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_agpd.replay.episode import Episode, EpisodeRecord, Ticket
+from lerobot_agpd.replay.store import ReplayStore
+from lerobot_agpd.replay.writer import EpisodeWriter
+
+SCALE = 0.5
+
+
+def episode(number, length=3, scale=SCALE, success=True) -> Episode:
+    rng = np.random.default_rng(number)
+    successes = np.zeros(length, dtype=bool)
+    successes[-1] = success
+    return Episode(
+        ticket=Ticket(number, 1_000_000 + number, scale),
+        task="a small task",
+        observations={
+            "observation.state": rng.normal(size=(length, 2)).astype(np.float32),
+            "observation.environment_state": rng.normal(size=(length, 3)).astype(np.float32),
+        },
+        actions=rng.normal(size=(length, 2)).astype(np.float32),
+        rewards=rng.normal(size=length).astype(np.float32),
+        successes=successes,
+        j=0.25 if scale else float("nan"),
+        shift=float("nan"),
+    )
+
+
+def record(rollout: Episode) -> EpisodeRecord:
+    ticket = rollout.ticket
+    return EpisodeRecord(
+        number=ticket.number,
+        seed=ticket.seed,
+        scale=ticket.scale,
+        length=len(rollout),
+        max_reward=rollout.max_reward,
+        success=rollout.success,
+        passed=bool(rollout.success),
+        trivial=False,
+        kept=bool(rollout.success),
+        j=rollout.j,
+        shift=rollout.shift,
+    )
+
+
+def same(left: EpisodeRecord, right: EpisodeRecord) -> bool:
+    return left.to_json() == right.to_json()  # NaN is not equal to itself
+
+
+@pytest.fixture
+def store(tmp_path) -> ReplayStore:
+    return ReplayStore(tmp_path / "agpd")
+
+
+@pytest.fixture
+def write(demonstrations):
+    """Finishes a round from one list of episodes per process."""
+    writer = EpisodeWriter(demonstrations.meta)
+
+    def finish(store, number, *shares):
+        for rank, rollouts in enumerate(shares):
+            spool = store.spool(number, rank)
+            for rollout in rollouts:
+                spool.add(rollout, record(rollout))
+            store.write_share(number, rank, lambda root, kept: writer.write(root, kept, number, "guided"))
+        report = {"round": number, "episodes": [r.to_json() for r in store.records(number, len(shares))]}
+        store.finish(number, len(shares), report)
+
+    return finish
+
+
+def equal_episodes(left: Episode, right: Episode) -> bool:
+    arrays = [(left.observations[k], right.observations[k]) for k in right.observations]
+    arrays += [
+        (left.actions, right.actions),
+        (left.rewards, right.rewards),
+        (left.successes, right.successes),
+    ]
+    return left.task == right.task and all(np.array_equal(a, b) and a.dtype == b.dtype for a, b in arrays)
+
+
+# ---- the spool ----
+
+
+def test_episode_round_trip(tmp_path):
+    rollout = episode(4)
+    rollout.save(tmp_path / "e.npz")
+    assert [path.name for path in tmp_path.iterdir()] == ["e.npz"]
+    loaded = Episode.load(tmp_path / "e.npz", record(rollout))
+    assert equal_episodes(loaded, rollout) and loaded.ticket == rollout.ticket and loaded.j == rollout.j
+    rollout.successes = None
+    rollout.save(tmp_path / "e.npz")
+    assert Episode.load(tmp_path / "e.npz", record(rollout)).successes is None
+
+
+def test_record_round_trip():
+    entry = record(episode(1, scale=0.0)).to_json()
+    assert entry["j"] is None and entry["shift"] is None
+    assert "NaN" not in json.dumps(entry)
+    again = EpisodeRecord.from_json(json.loads(json.dumps(entry)))
+    assert np.isnan(again.j) and np.isnan(again.shift) and again.to_json() == entry
+
+
+def test_spool_remembers(store):
+    spool = store.spool(0, 0)
+    rollouts = [episode(2), episode(0, length=5), episode(1, success=False)]
+    for rollout in rollouts:
+        spool.add(rollout, record(rollout))
+    reopened = ReplayStore(store.root).spool(0, 0)
+    assert list(reopened.records) == [2, 0, 1]
+    assert all(same(reopened.records[r.ticket.number], record(r)) for r in rollouts)
+    kept = reopened.kept()
+    assert [rollout.ticket.number for rollout in kept] == [0, 2]
+    assert equal_episodes(kept[0], rollouts[1]) and equal_episodes(kept[1], rollouts[0])
+
+
+@pytest.mark.parametrize("cut", [1, 20, 60])
+def test_spool_survives_a_truncated_last_line(store, cut):
+    spool = store.spool(0, 0)
+    for number in range(3):
+        spool.add(episode(number), record(episode(number)))
+    text = spool.log.read_text()
+    spool.log.write_text(text[:-cut])
+    continued = store.spool(0, 0)
+    assert set(continued.records) == {0, 1}
+    continued.add(episode(2), record(episode(2)))
+    assert spool.log.read_text() == text
+    assert set(store.spool(0, 0).records) == {0, 1, 2}
+
+
+def test_arrays_without_a_record_do_not_count(store):
+    """Killed between writing an episode's arrays and its record."""
+    spool = store.spool(0, 0)
+    episode(0).save(spool.arrays / "episode-000000.npz")
+    (spool.arrays / "episode-000001.partial.npz").write_bytes(b"half")
+    again = store.spool(0, 0)
+    assert not again.records and not again.kept()
+    again.add(episode(0), record(episode(0)))
+    assert len(again.kept()) == 1
+
+
+# ---- rounds ----
+
+
+def test_interrupted_round_is_continued_with_the_same_records(store, write):
+    first = store.spool(0, 0)
+    first.add(episode(0), record(episode(0)))
+    store.write_share(0, 0, lambda root, kept: root.mkdir())  # killed after writing an unreadable dataset
+    assert store.rounds() == []
+    again = ReplayStore(store.root)
+    assert same(again.spool(0, 0).records[0], record(episode(0)))
+    write(again, 0, [episode(1, length=4)])
+    (round_,) = again.rounds()
+    assert [entry["number"] for entry in round_.report["episodes"]] == [0, 1]
+    dataset = LeRobotDataset("local/x", root=round_.datasets[0])
+    assert list(dataset.meta.episodes["length"]) == [3, 4]
+
+
+def test_finished_round_holds_what_was_collected(store, write, demonstrations):
+    share = [episode(0), episode(1, length=1), episode(2, success=False), episode(3, length=4, scale=0.0)]
+    write(store, 0, share, [episode(0, length=2)])
+    (round_,) = store.rounds()
+    assert round_.number == 0 and [path.name for path in round_.datasets] == ["rank-0", "rank-1"]
+    assert [entry["kept"] for entry in round_.report["episodes"]] == [True, True, False, True, True]
+    dataset = LeRobotDataset("local/x", root=round_.datasets[0])
+    kept = [share[0], share[1], share[3]]
+    assert list(dataset.meta.episodes["length"]) == [3, 1, 4]
+    for name in ("agpd.round", "agpd.scale", "agpd.strategy", "next.reward", "next.success", "next.done"):
+        assert name in dataset.features
+    assert all(dataset.features[k] == f for k, f in demonstrations.features.items())
+    assert dataset.fps == demonstrations.fps
+    row = 0
+    for rollout in kept:
+        for step in range(len(rollout)):
+            frame = dataset[row]
+            for key, values in rollout.observations.items():
+                assert torch.equal(frame[key], torch.from_numpy(values[step]))
+            assert torch.equal(frame["action"], torch.from_numpy(rollout.actions[step]))
+            assert float(frame["next.reward"]) == float(rollout.rewards[step])
+            assert bool(frame["next.success"]) == bool(rollout.successes[step])
+            assert bool(frame["next.done"]) == (step == len(rollout) - 1)
+            assert int(frame["agpd.round"]) == 0
+            assert float(frame["agpd.scale"]) == rollout.ticket.scale
+            assert frame["agpd.strategy"] == ("guided" if rollout.ticket.scale else "replay")
+            assert frame["task"] == "a small task"
+            row += 1
+    assert row == len(dataset)
+
+
+def test_finish_leaves_manifest_report_and_nothing_partial(store, write):
+    write(store, 0, [episode(0)])
+    write(store, 1, [episode(0, success=False)])
+    names = sorted(path.name for path in store.root.iterdir())
+    assert names == ["manifest.json", "round-000", "round-001"]
+    assert sorted(path.name for path in (store.root / "round-000").iterdir()) == ["rank-0", "round.json"]
+    assert sorted(path.name for path in (store.root / "round-001").iterdir()) == ["round.json"]
+    manifest = json.loads((store.root / "manifest.json").read_text())
+    assert manifest == {
+        "rounds": [
+            {"folder": "round-000", "datasets": ["rank-0"], "round": 0},
+            {"folder": "round-001", "datasets": [], "round": 1},
+        ]
+    }
+    assert [len(round_.datasets) for round_ in store.rounds()] == [1, 0]
+
+
+def test_round_whose_manifest_was_not_written_is_found(store, write):
+    write(store, 0, [episode(0)])
+    before = (store.root / "manifest.json").read_text()
+    write(store, 1, [episode(1)])
+    (store.root / "manifest.json").write_text(before)
+    assert [round_.number for round_ in store.rounds()] == [0, 1]
+    (store.root / "manifest.json").unlink()
+    assert [round_.number for round_ in store.rounds()] == [0, 1]
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "null", '{"rounds": 3}', '{"rounds": [{}]}', '{"a": 1}'])
+def test_corrupted_manifest_is_named(store, content):
+    store.root.mkdir()
+    (store.root / "manifest.json").write_text(content)
+    with pytest.raises(ValueError, match="manifest.json is not a manifest of collected rounds"):
+        store.rounds()
+
+
+def test_missing_round_is_named(store, write):
+    write(store, 0, [episode(0)])
+    write(store, 1, [episode(1)])
+    (store.root / "round-000" / "round.json").unlink()
+    with pytest.raises(ValueError, match="round-000"):
+        store.rounds()
+
+
+def test_a_store_without_rounds(store):
+    assert store.rounds() == [] and store.merge("local/merged") is None
+    assert not store.root.exists()
+
+
+def test_merge_is_the_concatenation(store, write):
+    write(store, 0, [episode(0), episode(1, length=2)], [episode(2, length=5)])
+    write(store, 1, [episode(3, success=False)])
+    write(store, 2, [episode(4, length=2)])
+    store.merge("local/merged")
+    merged = store.merge("local/merged")  # again: replaced, not appended
+    assert sorted(p.name for p in store.root.glob("merged*")) == ["merged"]
+    parts = [LeRobotDataset("local/x", root=path) for r in store.rounds() for path in r.datasets]
+    frames = [part[i] for part in parts for i in range(len(part))]
+    assert len(merged) == len(frames) == 12 and merged.num_episodes == 4
+    for row, theirs in enumerate(frames):
+        ours = merged[row]
+        assert int(ours["index"]) == row
+        for key in ("observation.state", "action", "next.reward", "agpd.round", "agpd.scale", "next.done"):
+            assert torch.equal(ours[key], theirs[key])
+        assert ours["agpd.strategy"] == theirs["agpd.strategy"] and ours["task"] == theirs["task"]
+
+
+# ---- the writer ----
+
+
+def test_writer_refuses_another_shape(demonstrations, tmp_path):
+    rollout = episode(0)
+    rollout.observations["observation.state"] = np.zeros((3, 5), dtype=np.float32)
+    with pytest.raises(ValueError, match=r"'observation.state' with shape \(5,\).*\(2,\)"):
+        EpisodeWriter(demonstrations.meta).write(tmp_path / "d", [rollout], 0, "guided")
+
+
+def test_writer_leaves_out_what_the_environment_does_not_deliver(demonstrations, tmp_path):
+    rollout = episode(0)
+    del rollout.observations["observation.state"]
+    rollout.observations["observation.extra"] = np.zeros((3, 1), dtype=np.float32)
+    rollout.successes, rollout.task = None, ""
+    EpisodeWriter(demonstrations.meta).write(tmp_path / "d", [rollout], 7, "replay")
+    dataset = LeRobotDataset("local/x", root=tmp_path / "d")
+    absent = {"observation.state", "observation.extra", "next.success"}
+    assert not absent & set(dataset.features) and {"action", "next.reward"} <= set(dataset.features)
+    assert int(dataset[0]["agpd.round"]) == 7 and dataset[0]["task"] == "a small task"
