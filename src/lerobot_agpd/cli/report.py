@@ -94,7 +94,9 @@ def run(config: ReportConfig) -> None:
     """Evaluate, write and show."""
     results = [evaluate_policy(name, path, config) for name, path in config.policies.items()]
     results += [evaluate_run(name, path, config) for name, path in config.runs.items()]
-    rounds: list[dict[str, Any]] = next((result.collection["rounds"] for result in results if result.collection), [])
+    rounds: list[dict[str, Any]] = next(
+        (result.collection["rounds"] for result in results if result.collection), []
+    )
     config.output.mkdir(parents=True, exist_ok=True)
     content = {
         "environment": draccus.encode(config.env, EnvConfig),

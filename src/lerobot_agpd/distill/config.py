@@ -19,6 +19,9 @@ class AdversaryConfig:
     form: str = (
         "saturating"  # saturating: the student minimises log D, as printed; non_saturating: -log(1 - D)
     )
+    every: int = (
+        1  # training steps per adversarial step; more is cheaper, since each takes a second forward pass
+    )
     start: int = 500  # training steps before the adversary acts, so that D does not meet an untrained student
     width: int = 128  # width of D's two hidden layers
     lr: float = 1e-4  # learning rate of D
@@ -33,6 +36,7 @@ class AdversaryConfig:
             f"--policy.adversary.form must be one of {list(FORMS)}, got '{self.form}'",
         )
         require(self.start >= 0, f"--policy.adversary.start must not be negative, got {self.start}")
+        require(self.every >= 1, f"--policy.adversary.every must be at least 1, got {self.every}")
         require(self.width >= 1, f"--policy.adversary.width must be at least 1, got {self.width}")
         require(self.lr > 0, f"--policy.adversary.lr must be positive, got {self.lr}")
         require(

@@ -264,7 +264,8 @@ class Distillation:
         return total, log | self._round_log()
 
     def _adversarial_loss(self, rows: Batch) -> tuple[Tensor | float, dict[str, float]]:
-        if self.teacher_chunks is None or self.state.updates < self.config.adversary.start:
+        config, updates = self.config.adversary, self.state.updates
+        if self.teacher_chunks is None or updates < config.start or updates % config.every:
             return 0.0, {}
         assert self.student.discriminator is not None
         teacher_chunk, shared = self.teacher_chunks.at(rows[ROW], self.replay.seen_episodes)
@@ -275,7 +276,7 @@ class Distillation:
             student_chunk * shared_steps[:, None],
             teacher_chunk,
             embedding,
-            self.config.adversary,
+            config,
         )
         return terms.discriminator + terms.student, {
             "discriminator_loss": terms.discriminator.item(),

@@ -72,7 +72,11 @@ class Normaliser:
 
 def saved_statistics(pretrained_path: Path | str, config: PreTrainedConfig) -> Statistics | None:
     """Statistics stored with a checkpoint's preprocessor, or None where it has no normaliser."""
-    preprocessor, _ = make_pre_post_processors(config, pretrained_path=str(pretrained_path))
+    preprocessor, _ = make_pre_post_processors(
+        config,
+        pretrained_path=str(pretrained_path),
+        preprocessor_overrides={"device_processor": {"device": config.device}},
+    )
     for step in preprocessor.steps:
         if isinstance(step, NormalizerProcessorStep):
             return step.stats

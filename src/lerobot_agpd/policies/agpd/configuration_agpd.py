@@ -10,6 +10,7 @@ from pathlib import Path
 import draccus
 from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs import PreTrainedConfig
+from lerobot.optim import DiffuserSchedulerConfig
 from lerobot.policies.act.configuration_act import ACTConfig
 
 from lerobot_agpd.collect.config import CollectConfig
@@ -29,6 +30,10 @@ class AGPDConfig(ACTConfig):
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     adversary: AdversaryConfig = field(default_factory=AdversaryConfig)
     representation: RepresentationConfig = field(default_factory=RepresentationConfig)
+    scheduler_name: str | None = (
+        None  # learning rate schedule, e.g. cosine; default: constant, as LeRobot trains ACT
+    )
+    scheduler_warmup_steps: int = 500  # steps over which a scheduled learning rate rises
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -38,6 +43,12 @@ class AGPDConfig(ACTConfig):
                 f"--policy.collect.n_action_steps={n_steps} exceeds the student's chunk "
                 f"(--policy.chunk_size={self.chunk_size})"
             )
+
+    def get_scheduler_preset(self) -> DiffuserSchedulerConfig | None:
+        """The named schedule over the run's steps, None for a constant learning rate."""
+        if self.scheduler_name is None:
+            return None
+        return DiffuserSchedulerConfig(name=self.scheduler_name, num_warmup_steps=self.scheduler_warmup_steps)
 
     @property
     def action_delta_indices(self) -> None:
