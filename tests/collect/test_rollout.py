@@ -160,7 +160,6 @@ def test_slots_refill_at_once(n_envs, lengths, n_steps, order):
     assert run.envs.n_steps == n_steps
 
 
-# FAILS (src): the first masked reset leaves idle environments without an observation.
 def test_more_slots_than_tickets():
     """Happens with several tasks, among which a round's tickets are dealt."""
     run = rollouts(8, Decider())

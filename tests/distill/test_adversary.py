@@ -13,14 +13,14 @@ from lerobot_agpd.distill.adversary import (
 )
 from lerobot_agpd.distill.config import AdversaryConfig
 
-B, N, A, E, O = 16, 3, 2, 5, 4
+B, N, A, E, OBS = 16, 3, 2, 5, 4
 FORMS = ["saturating", "non_saturating"]
 
 
 class Student(nn.Module):
     def __init__(self):
         super().__init__()
-        self.chunk, self.embed = nn.Linear(O, N * A), nn.Linear(O, E)
+        self.chunk, self.embed = nn.Linear(OBS, N * A), nn.Linear(OBS, E)
 
     def forward(self, observation):
         return torch.tanh(self.chunk(observation)).view(-1, N, A), self.embed(observation)
@@ -37,7 +37,7 @@ def game():
     """Observations, teacher chunks, student and discriminator, in double precision."""
     torch.manual_seed(7)
     return (
-        torch.randn(B, O).double(),
+        torch.randn(B, OBS).double(),
         torch.randn(B, N, A).double().requires_grad_(),
         Student().double(),
         Discriminator(N, A, E, plain()).double(),

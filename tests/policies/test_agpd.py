@@ -232,7 +232,6 @@ def test_parameter_groups_are_named(policy):
         (lambda: RepresentationConfig(type="pixels"), "--policy.representation.type"),
         (lambda: RepresentationConfig(width=10, n_heads=4), "--policy.representation.width"),
         (lambda: RepresentationConfig(n_layers=0), "--policy.representation.n_layers"),
-        # FAILS (src): divides by n_heads before it checks it.
         (lambda: RepresentationConfig(n_heads=0), "--policy.representation.n_heads"),
         (lambda: RepresentationConfig(lr=0), "--policy.representation.lr"),
         (lambda: ReplayConfig(collected_share=1.0), "--policy.replay.collected_share"),

@@ -20,13 +20,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from lerobot_agpd.collect.config import EVALUATION_SEEDS
 from lerobot_agpd.envs.experts import Expert, make_expert
 from lerobot_agpd.envs.gymnasium_robotics import AGENT_POS, ENVIRONMENT_STATE, GymnasiumRoboticsEnv
 
 logger = logging.getLogger(__name__)
 
-# Evaluations use environment seeds from here on; a demonstration must not show their starts.
-FIRST_EVALUATION_SEED = 100_000
 # Attempts per wanted episode after which the expert is held to be broken.
 MAX_ATTEMPTS_PER_EPISODE = 10
 SUCCESS = "next.success"
@@ -60,10 +59,10 @@ class DemosConfig:
             raise ValueError(f"--env.type={self.env.type} has no scripted experts; use gymnasium_robotics.")
         if self.episodes < 1:
             raise ValueError(f"--episodes must be at least 1, got {self.episodes}.")
-        if self.seed < 0 or self.seed + self.episodes > FIRST_EVALUATION_SEED:
+        if self.seed < 0 or self.seed + self.episodes > EVALUATION_SEEDS[0]:
             raise ValueError(
                 f"--seed={self.seed} with --episodes={self.episodes}: the seeds of demonstrations lie in "
-                f"[0, {FIRST_EVALUATION_SEED}); evaluations use those from {FIRST_EVALUATION_SEED} on."
+                f"[0, {EVALUATION_SEEDS[0]}); evaluations use those from {EVALUATION_SEEDS[0]} on."
             )
         if self.root.exists():
             raise FileExistsError(f"--root={self.root} already exists; choose a new folder.")
@@ -167,7 +166,7 @@ def successful_episodes(
     """
     while len(report.seeds) < config.episodes:
         seed = config.seed + report.attempts
-        if seed >= FIRST_EVALUATION_SEED or report.attempts >= MAX_ATTEMPTS_PER_EPISODE * config.episodes:
+        if seed >= EVALUATION_SEEDS[0] or report.attempts >= MAX_ATTEMPTS_PER_EPISODE * config.episodes:
             raise RuntimeError(
                 f"Only {len(report.seeds)} of {config.episodes} episodes succeeded in {report.attempts} attempts "
                 f"({len(report.trivial_seeds)} trivial, {len(report.failed_seeds)} failed); next seed {seed}."

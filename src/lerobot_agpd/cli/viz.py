@@ -35,7 +35,7 @@ from lerobot_agpd.analysis.recording import (
     layout,
     log_rollout,
 )
-from lerobot_agpd.cli.demos import FIRST_EVALUATION_SEED
+from lerobot_agpd.collect.config import EVALUATION_SEEDS
 from lerobot_agpd.collect.rollout import Decision, Rollouts
 from lerobot_agpd.collect.strategies import GuidedTeacher
 from lerobot_agpd.distill.distillation import executed_steps
@@ -64,7 +64,7 @@ class VizConfig:
     policy: PreTrainedConfig | None = None  # the student: --policy.path=<checkpoint of a distilled policy>
     teacher: TeacherConfig = field(default_factory=TeacherConfig)  # what is not set is the checkpoint's
     episodes: int = 1  # episodes to record
-    seed: int = FIRST_EVALUATION_SEED  # environment seed of the first episode; also seeds the noise
+    seed: int = EVALUATION_SEEDS[0]  # environment seed of the first episode; also seeds the noise
     scale: float | None = None  # guidance scale; default: that of the run's next round, else the policy's
     output: Path = Path("outputs/rollout.rrd")  # recording to write
     png: Path | None = None  # still picture of the first episode to draw

@@ -122,6 +122,7 @@ class Rollouts:
         self.decider = decider
         self.stopwatch = stopwatch or Stopwatch()
         self.task = _task_description(envs)
+        self._was_reset = False
 
     @torch.no_grad()
     def run(self, tickets: Iterable[Ticket]) -> Iterator[Episode]:
@@ -155,13 +156,16 @@ class Rollouts:
                 mask[number], seeds[number] = True, ticket.seed
         if not mask.any():
             return
+        if not self._was_reset:
+            mask[:] = True  # sub-environments without a ticket need an observation too
+            self._was_reset = True
         with self.stopwatch.measure("environment"):
             raw, _ = self.envs.reset(seed=seeds, options={"reset_mask": mask, NEW_ROLLOUT_OPTION: True})
             observations = self._observe(raw)
-        for number in np.flatnonzero(mask):
+        for number in fresh:
             slot = slots[number]
-            assert slot is not None
-            slot.see(_row(observations, int(number)))
+            if slot is not None:
+                slot.see(_row(observations, number))
 
     def _observe(self, raw: Any) -> dict[str, Tensor]:
         """LeRobot's observation features, tensors (n_envs, ...) only."""

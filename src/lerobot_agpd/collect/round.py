@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from lerobot_agpd.collect.report import summarise
 from lerobot_agpd.collect.rollout import Decider, Rollouts, Stopwatch
-from lerobot_agpd.collect.seeds import noise_seed, round_tickets, share_of
+from lerobot_agpd.collect.seeds import noise_seed, round_tickets
 from lerobot_agpd.collect.success import SuccessFilter
 from lerobot_agpd.replay.episode import EpisodeRecord, Ticket
 from lerobot_agpd.replay.store import ReplayStore, Spool
@@ -67,9 +67,10 @@ class RoundRunner:
         spool = self.store.spool(number, self.rank)
         stopwatch = Stopwatch()
         tickets = round_tickets(
-            share_of(self.config.episodes, self.rank, self.n_ranks),
+            self.config.episodes,
             self.seed,
             self.rank,
+            self.n_ranks,
             number,
             scale,
             self.config.unguided_fraction,

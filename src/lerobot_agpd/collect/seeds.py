@@ -9,15 +9,24 @@ from lerobot_agpd.replay.episode import Ticket
 
 
 def round_tickets(
-    n_episodes: int, seed: int, rank: int, round_number: int, scale: float, unguided_fraction: float
+    n_episodes: int,
+    seed: int,
+    rank: int,
+    n_ranks: int,
+    round_number: int,
+    scale: float,
+    unguided_fraction: float,
 ) -> list[Ticket]:
-    """Episodes that one process collects in one round.
+    """The episodes of a round of n_episodes that one process collects.
 
-    Environment seeds come from SeedSequence([seed, rank, round]); unguided episodes are spread evenly.
+    Environment seeds come from SeedSequence([seed, rank, round]); unguided episodes are spread evenly over the
+    round, whatever the number of processes.
     """
+    first = sum(share_of(n_episodes, lower, n_ranks) for lower in range(rank))
+    n_episodes = share_of(n_episodes, rank, n_ranks)
     rng = np.random.default_rng(np.random.SeedSequence([seed, rank, round_number]))
     seeds = rng.integers(*COLLECTION_SEEDS, size=n_episodes)
-    unguided = np.diff(np.floor(np.arange(n_episodes + 1) * unguided_fraction + 1e-9)) > 0
+    unguided = np.diff(np.floor((first + np.arange(n_episodes + 1)) * unguided_fraction + 1e-9)) > 0
     return [
         Ticket(number, int(env_seed), 0.0 if alone else scale)
         for number, (env_seed, alone) in enumerate(zip(seeds, unguided, strict=True))

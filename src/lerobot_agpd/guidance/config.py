@@ -45,7 +45,9 @@ class GuidanceConfig:
     growth: float = 2.0  # factor by which the scale grows after a good round and shrinks after a bad one
     tolerance: float = 0.05  # how far guided success may fall below the unguided one in a good round
     min_scale: float = 0.05  # the adapted scale never falls below this
-    max_scale: float = 16.0  # the adapted scale never exceeds this
+    max_scale: float = (
+        2.0  # the adapted scale never exceeds this; beyond, strided DDIM carries x0 past the student
+    )
 
     def __post_init__(self) -> None:
         require(self.scale >= 0, f"--policy.guidance.scale must not be negative, got {self.scale}")
@@ -84,11 +86,11 @@ class RepresentationConfig:
             self.type in REPRESENTATIONS,
             f"--policy.representation.type must be one of {list(REPRESENTATIONS)}, got '{self.type}'",
         )
+        for name in ("width", "n_layers", "n_heads", "latent_dim"):
+            require(getattr(self, name) >= 1, f"--policy.representation.{name} must be at least 1")
         require(
             self.width % self.n_heads == 0,
             f"--policy.representation.width={self.width} must be divisible by n_heads={self.n_heads}",
         )
-        for name in ("width", "n_layers", "n_heads", "latent_dim"):
-            require(getattr(self, name) >= 1, f"--policy.representation.{name} must be at least 1")
         for name in ("weight", "lr"):
             require(getattr(self, name) > 0, f"--policy.representation.{name} must be positive")
