@@ -170,7 +170,7 @@ def test_student_chunk_is_what_the_policy_executes(monkeypatch, student):
     loaded = viz.load_student(config.policy)
     preprocessor, postprocessor = viz.make_pre_post_processors(config.policy, pretrained_path=str(student))
     observation = {key: torch.from_numpy(episode.observations[key][0]) for key in INPUTS}
-    chunk = loaded.policy.predict_action_chunk(preprocessor(observation))[:, :N_STEPS]
+    chunk = loaded.student.predict_action_chunk(preprocessor(observation))[:, :N_STEPS]
     np.testing.assert_allclose(rollout.decisions[0].chunks.student, postprocessor(chunk)[0], rtol=1e-5)
 
 

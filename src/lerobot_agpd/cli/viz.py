@@ -3,9 +3,8 @@
 import logging
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ import gymnasium as gym
 import numpy as np
 import rerun as rr
 import torch
-from gymnasium.vector import VectorEnv, VectorWrapper
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors
 from lerobot.envs.utils import env_to_policy_features
@@ -23,12 +21,9 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 from rich.console import Console
 from rich.table import Table
-from torch import Tensor
 
 from lerobot_agpd.analysis.recording import (
     Array,
-    Chunks,
-    DecisionRecord,
     RolloutRecord,
     blueprint,
     draw_still,
@@ -36,15 +31,14 @@ from lerobot_agpd.analysis.recording import (
     log_rollout,
 )
 from lerobot_agpd.collect.config import EVALUATION_SEEDS
-from lerobot_agpd.collect.rollout import Decision, Rollouts
+from lerobot_agpd.collect.recorders import DecisionRecorder, FrameRecorder
+from lerobot_agpd.collect.rollout import Rollouts
 from lerobot_agpd.collect.strategies import GuidedTeacher
-from lerobot_agpd.distill.distillation import executed_steps
 from lerobot_agpd.distill.environment import check_environment_fits
+from lerobot_agpd.distill.guided import Proposer
 from lerobot_agpd.distill.state import DistillationState, replay_root
 from lerobot_agpd.distill.student import DistilledStudent
-from lerobot_agpd.guidance.alignment import Alignment
 from lerobot_agpd.guidance.config import TeacherConfig
-from lerobot_agpd.guidance.discrepancy import ActionDiscrepancy, Discrepancy, StateDiscrepancy
 from lerobot_agpd.guidance.teacher import check_teacher_fits, load_teacher
 from lerobot_agpd.replay.episode import Episode, Ticket
 from lerobot_agpd.replay.normalisation import Normaliser
@@ -106,48 +100,7 @@ class VizConfig:
 # ---- student and teacher ----
 
 
-@dataclass(frozen=True)
-class Student:
-    """A trained student with its checkpoint's normalisation."""
-
-    policy: DistilledStudent
-    normaliser: Normaliser
-
-    @property
-    def device(self) -> str:
-        """Where it computes."""
-        return str(self.policy.config.device)
-
-    def propose(self, observation: Mapping[str, Tensor]) -> Tensor:
-        """Its chunk (B, S, A) at raw observations, in its own units."""
-        batch = {
-            key: self.normaliser.normalise(key, observation[key]).to(self.device)
-            for key in self.policy.config.input_features
-        }
-        return self.policy.predict_action_chunk(batch)
-
-    def state_discrepancy(
-        self,
-        alignment: Alignment,
-        observation: Mapping[str, Tensor],
-        chunk_hat: Tensor,
-        action_j: ActionDiscrepancy,
-    ) -> Discrepancy:
-        """J between the futures that its representation predicts."""
-        assert self.policy.representation is not None
-        config = self.policy.config
-        vectors = [key for key in config.input_features if key not in config.image_features]
-        normalised = [self.normaliser.normalise(key, observation[key]) for key in vectors]
-        return StateDiscrepancy(
-            representation=self.policy.representation,
-            observation=torch.cat(normalised, dim=1).to(chunk_hat.device),
-            target=chunk_hat[:, : alignment.n_steps],
-            to_student=alignment.teacher_in_student_units,
-            reference=action_j,
-        )
-
-
-def load_student(config: PreTrainedConfig) -> Student:
+def load_student(config: PreTrainedConfig) -> Proposer:
     """Load the checkpoint at `config.pretrained_path`.
 
     Raises:
@@ -164,7 +117,7 @@ def load_student(config: PreTrainedConfig) -> Student:
     )
     for step in preprocessor.steps:
         if isinstance(step, NormalizerProcessorStep) and step.stats is not None:
-            return Student(policy.eval(), Normaliser(config, step.stats))
+            return Proposer(policy.eval(), Normaliser(config, step.stats))
     raise ValueError(f"the preprocessor in --policy.path={path} holds no statistics to normalise with")
 
 
@@ -179,24 +132,8 @@ def make_guided_teacher(config: VizConfig) -> GuidedTeacher:
     teacher = load_teacher(replace(policy_config.teacher, **chosen), policy_config.device)
     check_environment_fits(config.env, policy_config, teacher)
     check_teacher_fits(teacher, env_to_policy_features(config.env), policy_config.action_feature)
-    student = load_student(policy_config)
-    alignment = Alignment(
-        start=teacher.start,
-        n_steps=executed_steps(policy_config, teacher),
-        teacher_units=teacher.to_units,
-        teacher_raw=teacher.to_raw,
-        student_units=partial(student.normaliser.normalise, "action"),
-        student_raw=partial(student.normaliser.unnormalise, "action"),
-    )
-    learned = student.policy.representation is not None
-    return GuidedTeacher(
-        teacher,
-        student.propose,
-        alignment,
-        policy_config.guidance,
-        torch.Generator(device=policy_config.device).manual_seed(config.seed),
-        partial(student.state_discrepancy, alignment) if learned else None,
-    )
+    noise = torch.Generator(device=policy_config.device).manual_seed(config.seed)
+    return load_student(policy_config).guided(teacher, noise)
 
 
 def guidance_scale(config: VizConfig) -> float:
@@ -219,86 +156,6 @@ def guidance_scale(config: VizConfig) -> float:
 
 
 # ---- recording a rollout ----
-
-
-class DecisionRecorder:
-    """Decides as a guided teacher does, and remembers what the teacher alone and the student would have done.
-
-    Attributes:
-        decisions: of the running episode; the caller takes them and clears the list.
-    """
-
-    def __init__(self, guided: GuidedTeacher):
-        """Record the decisions of `guided`, for one environment."""
-        self.guided = guided
-        self.decisions: list[DecisionRecord] = []
-
-    @property
-    def n_obs_steps(self) -> int:
-        """The teacher's history."""
-        return self.guided.n_obs_steps
-
-    def decide(self, history: Mapping[str, Tensor], scale: Tensor) -> Decision:
-        """The guided decision; the unguided one is drawn first, from the same noise."""
-        noise = self.guided.generator.get_state()
-        alone = self.guided.decide(history, torch.zeros_like(scale))
-        self.guided.generator.set_state(noise)
-        decision = self.guided.decide(history, scale)
-        n_steps = self.guided.alignment.n_steps
-        chunk_hat = self.guided.propose({key: value[:, -1] for key, value in history.items()})
-        student = self.guided.alignment.student_raw(chunk_hat[:, :n_steps])
-        self.decisions.append(
-            DecisionRecord(
-                step=len(self.decisions) * n_steps,
-                chunks=Chunks(_first(alone.actions), _first(decision.actions), _first(student)),
-                j_teacher=float(alone.j[0]),
-                j_guided=float(decision.j[0]),
-                shift_in_sigmas=float(decision.shift[0]),
-            )
-        )
-        return decision
-
-
-class FrameRecorder(VectorWrapper):
-    """Renders the first environment before every step.
-
-    Attributes:
-        frames: of the running episode, (H, W, 3) uint8 each; a reset starts a new list.
-    """
-
-    def __init__(self, env: VectorEnv):
-        """Render `env`."""
-        super().__init__(env)
-        self.frames: list[Array] = []
-
-    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset and render."""
-        result = self.env.reset(seed=seed, options=options)
-        self.frames = [self._render()]
-        return result
-
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step and, unless the episode is over, render."""
-        result = self.env.step(actions)
-        _, _, terminated, truncated, _ = result
-        if not (terminated[0] or truncated[0]):
-            self.frames.append(self._render())
-        return result
-
-    def _render(self) -> Array:
-        try:
-            rendered = self.env.render()
-        except Exception as error:
-            raise RuntimeError(
-                f"rendering failed ({error}). MuJoCo environments need an OpenGL backend: set the environment variable "
-                "MUJOCO_GL=egl (GPU or Mesa) or MUJOCO_GL=osmesa (software); or record without frames: --render=false"
-            ) from error
-        frame = rendered[0] if rendered else None
-        if not isinstance(frame, np.ndarray):
-            raise RuntimeError(
-                "the environment renders no pictures; pass --env.render_mode=rgb_array or --render=false"
-            )
-        return frame
 
 
 def record_rollouts(
@@ -342,10 +199,6 @@ def plane_to_frame(space: gym.Space, frame: Array | None) -> Callable[[Array], A
         return lambda actions: actions
     size = np.array([frame.shape[1], frame.shape[0]])
     return lambda actions: (actions - space.low) / (space.high - space.low) * size
-
-
-def _first(chunks: Tensor) -> Array:
-    return chunks[0].float().cpu().numpy()
 
 
 # ---- the command ----

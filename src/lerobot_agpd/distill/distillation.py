@@ -2,7 +2,7 @@
 
     T  = demonstrations                                    replay/
     repeat
-        stage 1  A_hat = pi_phi(O)                         `_propose`                  Eq. 19
+        stage 1  A_hat = pi_phi(O)                         distill/guided.py           Eq. 19
                  A ~ guided teacher near A_hat             collect/strategies.py       Eq. 20
                  execute, keep what succeeds: T += tau     `collect_round`
         stage 2  L = L_IL + s * L_AIL on T                 `extra_losses`              Eq. 21-22
@@ -29,12 +29,11 @@ from lerobot_agpd.collect.round import RoundRunner
 from lerobot_agpd.collect.strategies import GuidedTeacher, TeacherAlone
 from lerobot_agpd.distill.adversary import adversary_terms
 from lerobot_agpd.distill.environment import check_environment_fits, run_environment
+from lerobot_agpd.distill.guided import Proposer, executed_steps
 from lerobot_agpd.distill.relabel import TeacherChunks
 from lerobot_agpd.distill.schedule import due_round
 from lerobot_agpd.distill.state import DistillationState, replay_root
-from lerobot_agpd.guidance.alignment import Alignment
 from lerobot_agpd.guidance.controller import next_scale
-from lerobot_agpd.guidance.discrepancy import ActionDiscrepancy, Discrepancy, StateDiscrepancy
 from lerobot_agpd.guidance.representation import reconstruction_loss
 from lerobot_agpd.guidance.teacher import DiffusionTeacher, check_teacher_fits, load_teacher
 from lerobot_agpd.replay.memory import Batch, FrameMemory
@@ -190,53 +189,10 @@ class Distillation:
 
     def _make_decider(self, number: int) -> GuidedTeacher | TeacherAlone:
         assert self.teacher is not None and self.rounds is not None
-        generator = self.rounds.noise(number)
-        alignment = self._alignment()
+        noise = self.rounds.noise(number)
         if self.config.collect.strategy == "replay":
-            return TeacherAlone(self.teacher, alignment.n_steps, generator)
-        learned = self.student.representation is not None
-        return GuidedTeacher(
-            self.teacher,
-            self._propose,
-            alignment,
-            self.config.guidance,
-            generator,
-            self._state_discrepancy if learned else None,
-        )
-
-    def _propose(self, observation: Mapping[str, Tensor]) -> Tensor:
-        """The student's chunk A_hat (B, S, A) at raw observations, in its own units (Eq. 19)."""
-        normaliser, device = self.replay.memory.normaliser, self.config.device
-        batch = {
-            key: normaliser.normalise(key, observation[key]).to(device) for key in self.config.input_features
-        }
-        return self.student.predict_action_chunk(batch)
-
-    def _alignment(self) -> Alignment:
-        assert self.teacher is not None
-        normaliser = self.replay.memory.normaliser
-        return Alignment(
-            start=self.teacher.start,
-            n_steps=executed_steps(self.config, self.teacher),
-            teacher_units=self.teacher.to_units,
-            teacher_raw=self.teacher.to_raw,
-            student_units=lambda actions: normaliser.normalise("action", actions),
-            student_raw=lambda actions: normaliser.unnormalise("action", actions),
-        )
-
-    def _state_discrepancy(
-        self, observation: Mapping[str, Tensor], chunk_hat: Tensor, action_j: ActionDiscrepancy
-    ) -> Discrepancy:
-        assert self.student.representation is not None
-        normaliser, alignment = self.replay.memory.normaliser, self._alignment()
-        vectors = [normaliser.normalise(key, observation[key]) for key in self.replay.vector_keys]
-        return StateDiscrepancy(
-            representation=self.student.representation,
-            observation=torch.cat(vectors, dim=1).to(chunk_hat.device),
-            target=chunk_hat[:, : alignment.n_steps],
-            to_student=alignment.teacher_in_student_units,
-            reference=action_j,
-        )
+            return TeacherAlone(self.teacher, executed_steps(self.config, self.teacher), noise)
+        return Proposer(self.student, self.replay.memory.normaliser).guided(self.teacher, noise)
 
     def _report(self, number: int, records: Any, seconds: Mapping[str, float]) -> dict[str, Any]:
         assert self.rounds is not None
@@ -327,22 +283,6 @@ class Distillation:
     def save(self, folder: Path) -> None:
         """Write the counters beside a checkpoint's weights."""
         self.state.save(folder)
-
-
-def executed_steps(config: Any, teacher: DiffusionTeacher) -> int:
-    """Steps n of a chunk that collection executes and compares.
-
-    Raises:
-        ValueError: if more are asked for than either policy predicts.
-    """
-    n_steps = config.collect.n_action_steps or min(config.n_action_steps, teacher.n_action_steps)
-    limit = min(config.chunk_size, teacher.n_chunk_steps)
-    if n_steps > limit:
-        raise ValueError(
-            f"--policy.collect.n_action_steps={n_steps} exceeds what both policies predict from the current step "
-            f"on: the student {config.chunk_size} (--policy.chunk_size), the teacher {teacher.n_chunk_steps}"
-        )
-    return n_steps
 
 
 def _log_round(report: Mapping[str, Any]) -> None:
