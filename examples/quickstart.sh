@@ -5,7 +5,7 @@
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
 output=${1:-outputs/quickstart}
-export HF_HUB_OFFLINE=1 OMP_NUM_THREADS=${OMP_NUM_THREADS:-1} MUJOCO_GL=${MUJOCO_GL:-egl}
+export HF_HUB_OFFLINE=1 OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
 if [ -e "$output" ]; then
     echo "$output already exists; remove it or name another folder" >&2
     exit 1
@@ -14,32 +14,47 @@ mkdir -p "$output"
 
 student=(--config_path="$here/presets/student_cpu.yaml"
     --dataset.repo_id=local/fetch_pick_and_place --dataset.root="$here/quickstart/demonstrations"
-    --steps=2000 --save_freq=500 --log_freq=100)
+    --steps=3000 --save_freq=1000 --log_freq=250)
 env=(--env.type=gymnasium_robotics --env.task=FetchPickAndPlace-v4)
-# LeRobot prints a traceback when FFmpeg's libraries are absent; state-only data needs none. It goes to the logs.
-quiet() { "$@" 2> >(tee "$log" | grep --line-buffered -E "round |WARNING.*round|Training: +[0-9]*[05]0?%|End of training|^[A-Za-z]*Error" >&2); }
 
-echo "== 1/4 behaviour cloning of ten demonstrations"
-log=$output/cloning.log quiet lerobot-train "${student[@]}" --output_dir="$output/cloning" \
-    --policy.collect.every=0 --policy.adversary.weight=0
+# Show a command's progress and keep all it prints in a log. (Without FFmpeg's libraries LeRobot prints tracebacks at
+# every dataset; data without cameras needs none.)
+show='step:[0-9.]+K? .*imitation_loss:[0-9.]+|round [0-9]+: .*|evaluated .*'
+logged() {
+    local log=$output/$1.log
+    shift
+    if ! "$@" 2>&1 | tee "$log" | stdbuf -oL tr '\r' '\n' | { grep --line-buffered -oE "$show" || true; }; then
+        tail -n 30 "$log" >&2
+        return 1
+    fi
+}
 
-echo "== 2/4 AGPD: the same student, a diffusion teacher and five collection rounds"
-log=$output/agpd.log quiet lerobot-train "${student[@]}" "${env[@]}" --output_dir="$output/agpd" \
+echo "== 1/4 in the background: behaviour cloning of ten demonstrations"
+lerobot-train "${student[@]}" --output_dir="$output/cloning" --policy.collect.every=0 --policy.adversary.weight=0 \
+    >"$output/cloning.log" 2>&1 &
+cloning=$!
+
+echo "== 2/4 AGPD: the same student, a diffusion teacher, five rounds of 50 episodes"
+logged agpd lerobot-train "${student[@]}" "${env[@]}" --output_dir="$output/agpd" \
     --policy.teacher.path="$here/quickstart/teacher" \
-    --policy.collect.warmup=500 --policy.collect.every=250 --policy.collect.rounds=5 --policy.collect.episodes=50
+    --policy.collect.warmup=500 --policy.collect.every=400 --policy.collect.rounds=5 --policy.collect.episodes=50
+wait $cloning || { tail -n 30 "$output/cloning.log" >&2 && exit 1; }
 
 echo "== 3/4 evaluation on 200 seeds that neither training nor collection used"
-log=$output/report.log quiet lerobot-agpd-report "${env[@]}" --output="$output" --title="FetchPickAndPlace, 10 demonstrations" \
+logged report lerobot-agpd-report "${env[@]}" --output="$output" --title="FetchPickAndPlace, 10 demonstrations" \
     --policies="{teacher: $here/quickstart/teacher}" --runs="{cloning: $output/cloning, AGPD student: $output/agpd}" \
     --episodes=200 --curve_episodes=50
 
 echo "== 4/4 a recorded rollout"
-log=$output/viz.log quiet lerobot-agpd-viz --policy.path="$output/agpd/checkpoints/last/pretrained_model" "${env[@]}" \
-    --render=false --output="$output/rollout.rrd"
+logged viz lerobot-agpd-viz --policy.path="$output/agpd/checkpoints/last/pretrained_model" "${env[@]}" \
+    --render=false --output="$output/rollout.rrd" --png="$output/rollout.png"
 
-echo "table: $output/report.md   picture: $output/curves.png   recording: rerun $output/rollout.rrd"
+echo
+cat "$output/report.md"
+echo
+echo "table $output/report.md, pictures $output/curves.png and $output/rollout.png, recording: rerun $output/rollout.rrd"
 
 # Teacher and demonstrations come from the project's own commands:
 #   lerobot-agpd-demos --env.type=gymnasium_robotics --env.task=FetchPickAndPlace-v4 --episodes=10 --seed=5000 --root=...
 #   lerobot-agpd-demos --env.type=gymnasium_robotics --env.task=FetchPickAndPlace-v4 --episodes=400 --seed=10000 --root=...
-#   lerobot-train --config_path=examples/presets/teacher_cpu.yaml --policy.prediction_type=sample --steps=6000 --dataset...
+#   lerobot-train --config_path=examples/presets/teacher_cpu.yaml --steps=6000 --dataset.repo_id=... --dataset.root=...

@@ -7,7 +7,7 @@ method=$1 root=$2 output=$3
 shift 3
 common=(--config_path="$(dirname "$0")/../../examples/presets/student_cpu.yaml"
     --dataset.repo_id=local/pusht20 --dataset.root="$root" --output_dir="$output"
-    --steps=12000 --save_freq=2000 --log_freq=200 --seed=1000)
+    --steps=10000 --save_freq=2000 --log_freq=200 --seed=1000)
 case $method in
 cloning) exec lerobot-train "${common[@]}" --policy.collect.every=0 --policy.adversary.weight=0 "$@" ;;
 agpd)
@@ -15,7 +15,7 @@ agpd)
     shift
     exec lerobot-train "${common[@]}" --policy.teacher.path="$teacher" \
         --env.type=pusht --env.obs_type=environment_state_agent_pos --policy.collect.min_reward=0.9 \
-        --policy.collect.warmup=2000 --policy.collect.every=800 --policy.collect.episodes=50 "$@"
+        --policy.collect.warmup=1600 --policy.collect.every=650 --policy.collect.episodes=50 --policy.collect.n_envs=25 "$@"
     ;;
 *) echo "unknown method '$method': cloning or agpd" >&2 && exit 2 ;;
 esac

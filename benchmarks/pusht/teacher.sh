@@ -5,7 +5,7 @@ set -euo pipefail
 export HF_HUB_OFFLINE=1 OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"
 root=$1 output=$2
 shift 2
-lerobot-train --policy.type=diffusion_transformer --policy.denoiser=mlp \
+lerobot-train --policy.type=diffusion_transformer --policy.denoiser=mlp --policy.prediction_type=epsilon \
     --policy.noise_scheduler_type=DDIM --policy.num_inference_steps=16 \
     --policy.device=cpu --policy.use_amp=true --policy.push_to_hub=false \
     --dataset.repo_id=local/pusht_keypoints --dataset.root="$root" \

@@ -37,6 +37,17 @@ class MethodResult:
             "mean_max_reward": asdict(mean(self.final.max_rewards)),
         }
 
+    @classmethod
+    def from_json(cls, entry: Mapping[str, Any]) -> MethodResult:
+        """The inverse of `to_json`; intervals are computed anew."""
+        return cls(
+            name=entry["name"],
+            final=Evaluation(**entry["final"]),
+            latency=Latency(**entry["latency"]),
+            curve={int(step): Evaluation(**evaluation) for step, evaluation in entry["curve"].items()},
+            collection=dict(entry["collection"]),
+        )
+
 
 HEADER = ("", "success", "mean max reward", "N", "episodes generated / kept", "parameters", "ms per chunk")
 

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from lerobot_agpd.analysis.evaluation import Checkpoint, checkpoint_steps
 from lerobot_agpd.analysis.report import HEADER, MethodResult, markdown, plot_curves, table_rows
+from lerobot_agpd.analysis.statistics import success_rate
 from lerobot_agpd.replay.store import ReplayStore
 
 logger = logging.getLogger(__name__)
@@ -58,11 +59,11 @@ def evaluate_run(name: str, run: Path, config: ReportConfig) -> MethodResult:
     curve = {}
     for step, path in steps.items():
         if config.curve_episodes and step != last:
-            logger.info("%s, step %d", name, step)
             checkpoint = Checkpoint(path, config.device)
             curve[step] = checkpoint.evaluate(
                 config.env, config.curve_episodes, config.batch_size, config.seed
             )
+            logger.info("evaluated %s at step %d: %s", name, step, success_rate(curve[step].successes))
     result = evaluate_policy(name, steps[last], config)
     if curve:
         result.curve = {**curve, last: result.final}
@@ -75,9 +76,9 @@ def evaluate_run(name: str, run: Path, config: ReportConfig) -> MethodResult:
 
 def evaluate_policy(name: str, path: Path, config: ReportConfig) -> MethodResult:
     """Evaluate one checkpoint."""
-    logger.info("%s: %d episodes from seed %d", name, config.episodes, config.seed)
     checkpoint = Checkpoint(path, config.device)
     final = checkpoint.evaluate(config.env, config.episodes, config.batch_size, config.seed)
+    logger.info("evaluated %s: success %s", name, success_rate(final.successes))
     return MethodResult(name, final, checkpoint.latency())
 
 

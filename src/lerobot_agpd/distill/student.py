@@ -18,6 +18,7 @@ from lerobot_agpd.distill.gradient_norms import GradientNorms
 from lerobot_agpd.guidance.representation import StateRepresentation
 from lerobot_agpd.replay.memory import delivers_single_frames
 from lerobot_agpd.replay.normalisation import Statistics
+from lerobot_agpd.weights import require_weights
 
 logger = logging.getLogger(__name__)
 
@@ -140,6 +141,12 @@ class DistilledStudent(nn.Module):
         super()._save_pretrained(save_directory, state_dict=state_dict)  # type: ignore[misc]
         if self._distillation is not None:
             self._distillation.save(save_directory)
+
+    @classmethod
+    def _load_as_safetensor(cls, model: Any, model_file: str, map_location: str, strict: bool) -> Any:
+        # A student may be started with an adversary or a representation that its checkpoint had none of.
+        require_weights(model, model_file, optional=("discriminator", "representation"))
+        return super()._load_as_safetensor(model, model_file, map_location, strict)  # type: ignore[misc]
 
     # ---- features ----
 

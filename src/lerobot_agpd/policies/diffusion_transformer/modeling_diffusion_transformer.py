@@ -18,6 +18,7 @@ from lerobot_agpd.policies.diffusion_transformer.denoisers import MLPDenoiser
 from lerobot_agpd.replay.memory import FrameMemory, delivers_single_frames, gather_rows
 from lerobot_agpd.replay.normalisation import Statistics
 from lerobot_agpd.run import this_run
+from lerobot_agpd.weights import require_weights
 
 logger = logging.getLogger(__name__)
 
@@ -130,6 +131,11 @@ class DiffusionTransformerPolicy(DiffusionPolicy):
         else:
             ema.restore(self.diffusion.parameters())
         self._ema_is_active = active
+
+    @classmethod
+    def _load_as_safetensor(cls, model: Any, model_file: str, map_location: str, strict: bool) -> Any:
+        require_weights(model, model_file)
+        return super()._load_as_safetensor(model, model_file, map_location, strict)
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
         was_active = self._ema_is_active

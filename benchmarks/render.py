@@ -1,0 +1,80 @@
+"""Write docs/results/*.md and the README's tables from the committed results in benchmarks/*/report.json.
+
+usage: python benchmarks/render.py          (python benchmarks/render.py --check fails if a page is out of date)
+"""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+from lerobot_agpd.analysis.report import MethodResult, markdown
+
+ROOT = Path(__file__).parent.parent
+COLUMNS = ("round", "scale", "guided", "unguided", "generated", "kept", "shift in sigmas", "seconds")
+
+
+def results(folder: Path) -> list[MethodResult]:
+    return [
+        MethodResult.from_json(entry) for entry in json.loads((folder / "report.json").read_text())["methods"]
+    ]
+
+
+def share(counts: dict) -> str:
+    counted = counts["generated"] - counts["trivial"]
+    return f"{counts['successful']} / {counted}" if counted else "-"
+
+
+def rounds_table(rounds: list[dict]) -> str:
+    rows = [
+        (
+            str(entry["round"]),
+            f"{entry['scale']:.3g}",
+            share(entry["guided"]),
+            share(entry["unguided"]),
+            str(entry["generated"]),
+            str(entry["kept"]),
+            "-" if entry["mean_shift_in_sigmas"] is None else f"{entry['mean_shift_in_sigmas']:.2f}",
+            f"{sum(entry['seconds'].values()):.0f}",
+        )
+        for entry in rounds
+    ]
+    lines = [COLUMNS, tuple("---" for _ in COLUMNS), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def page(folder: Path) -> str:
+    parts = [(folder / "README.md").read_text().rstrip(), markdown(results(folder)).rstrip()]
+    if (folder / "curves.png").exists():
+        parts.append(f"![learning curves](../../benchmarks/{folder.name}/curves.png)")
+    for result in results(folder):
+        if result.collection:
+            parts.append(
+                f"## Collection rounds of {result.name}\n\nPassed / counted episodes; trivial starts count nowhere.\n\n"
+                + rounds_table(result.collection["rounds"]).rstrip()
+            )
+    return "\n\n".join(parts) + "\n"
+
+
+def readme(text: str, folder: Path) -> str:
+    table = markdown(results(folder)).rstrip()
+    pattern = re.compile(rf"(<!-- {folder.name}-results -->\n).*?(<!-- end -->)", re.DOTALL)
+    return pattern.sub(lambda match: f"{match[1]}{table}\n{match[2]}", text)
+
+
+def main() -> None:
+    pages = {ROOT / "README.md": (ROOT / "README.md").read_text()}
+    for folder in sorted(path.parent for path in (ROOT / "benchmarks").glob("*/report.json")):
+        pages[ROOT / "docs" / "results" / f"{folder.name}.md"] = page(folder)
+        pages[ROOT / "README.md"] = readme(pages[ROOT / "README.md"], folder)
+    stale = [path for path, text in pages.items() if not path.exists() or path.read_text() != text]
+    if "--check" in sys.argv:
+        sys.exit(f"out of date, run benchmarks/render.py: {[str(p) for p in stale]}" if stale else 0)
+    for path in stale:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(pages[path])
+        print(f"wrote {path}")
+
+
+if __name__ == "__main__":
+    main()
