@@ -7,7 +7,7 @@ from pathlib import Path
 
 BIN = Path(sys.executable).parent
 
-REACH = ["--env.type=gymnasium_robotics", "--env.task=FetchReach-v4"]
+PICK = ["--env.type=gymnasium_robotics", "--env.task=FetchPickAndPlace-v4"]
 QUIET = ["--num_workers=0", "--env_eval_freq=0", "--log_freq=10"]
 TINY_STUDENT = [
     "--policy.type=agpd",

@@ -76,7 +76,9 @@ def block_keypoints(block_poses: np.ndarray) -> np.ndarray:
     block, shapes = PushTEnv.add_tee(pymunk.Space(), (0, 0), 0)
     corners = np.empty((len(block_poses), 16), dtype=np.float32)
     for row, (x, y, angle) in zip(corners, block_poses.astype(float), strict=True):
-        block.angle = angle  # first: pymunk turns the block about its centre of gravity, which moves its origin
+        block.angle = (
+            angle  # first: pymunk turns the block about its centre of gravity, which moves its origin
+        )
         block.position = (x, y)
         row[:] = PushTEnv.get_keypoints(shapes).flatten()
     return corners

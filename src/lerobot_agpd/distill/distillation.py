@@ -55,6 +55,7 @@ class Distillation:
         student: the policy in training.
         dataset_meta: metadata of the demonstrations.
         dataset_stats: their statistics.
+        seed: of environments, sampling noise and the choice of collected frames.
 
     Raises:
         ValueError: if a teacher or an environment is needed and missing, or does not fit.
@@ -65,21 +66,20 @@ class Distillation:
         student: DistilledStudent,
         dataset_meta: LeRobotDatasetMetadata,
         dataset_stats: Statistics | None,
+        seed: int,
     ):
         self.student = student
         self.config = student.config
         self.run = this_run()
-        self.seed = torch.initial_seed() % 2**32
+        self.seed = seed
         self.rank, self.n_ranks = process_rank(), world_size()
         self.state = DistillationState.restore(self.config, self.run)
-        self.replay = Replay(
-            FrameMemory(self.config, dataset_meta, dataset_stats),
-            self.config,
-            self.config.replay.collected_share,
-        )
+        memory = FrameMemory(self.config, dataset_meta, dataset_stats)
+        self.demonstrations = memory.dataset.meta
+        self.replay = Replay(memory, self.config, self.config.replay.collected_share)
         self.replay.seen_episodes.update(self.state.seen_episodes)
-        self.teacher = self._load_teacher(dataset_meta)
-        self.rounds = self._make_rounds(dataset_meta)
+        self.teacher = self._load_teacher()
+        self.rounds = self._make_rounds()
         self.teacher_chunks = self._make_teacher_chunks()
         self.reports: list[Mapping[str, Any]] = []
         self._adopt_finished_rounds()
@@ -91,16 +91,16 @@ class Distillation:
         """Whether any part of the method uses the teacher."""
         return self.config.collect.enabled or self.config.adversary.weight > 0
 
-    def _load_teacher(self, dataset_meta: LeRobotDatasetMetadata) -> DiffusionTeacher | None:
+    def _load_teacher(self) -> DiffusionTeacher | None:
         if not self.needs_teacher:
             return None
         teacher = load_teacher(self.config.teacher, self.config.device)
         check_teacher_fits(
-            teacher, self.student.demonstrated_features(dataset_meta), self.config.action_feature
+            teacher, self.student.demonstrated_features(self.demonstrations), self.config.action_feature
         )
         return teacher
 
-    def _make_rounds(self, dataset_meta: LeRobotDatasetMetadata) -> RoundRunner | None:
+    def _make_rounds(self) -> RoundRunner | None:
         if not self.config.collect.enabled:
             return None
         assert self.teacher is not None
@@ -112,7 +112,7 @@ class Distillation:
             store=ReplayStore(root),
             env_config=env_config,
             policy_config=self.config,
-            demonstrations=dataset_meta,
+            demonstrations=self.demonstrations,
             seed=self.seed,
             rank=self.rank,
             n_ranks=self.n_ranks,

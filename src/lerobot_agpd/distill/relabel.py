@@ -67,17 +67,21 @@ class TeacherChunks:
         return (wanted & torch.isnan(chunks[:, 0, 0]).cpu()).nonzero()[:, 0]
 
     def _sample(self, rows: Tensor) -> None:
+        """Sample whole episodes, each with noise of its own: when an episode is sampled does not change its chunks."""
         assert self._chunks is not None
-        start = time.perf_counter()
+        began = time.perf_counter()
         keys = list(self.teacher.input_features)
-        generator = torch.Generator(device=self._chunks.device).manual_seed(self.seed + int(rows[0]))
-        for part in rows.split(BATCH_SIZE):
-            history = self.replay.history(part, keys, self.teacher.n_obs_steps)
-            raw = self.teacher.sample(history, generator=generator)[:, : self.n_shared]
-            normalised = self.replay.memory.normaliser.normalise(ACTION, raw.to(self._chunks.device))
-            self._chunks[part] = 0.0
-            self._chunks[part, : self.n_shared] = normalised
-        self.seconds += time.perf_counter() - start
+        table = self.replay.raw
+        for start in table.episode_start[rows].unique().tolist():
+            episode = torch.arange(start, int(table.episode_end[start]))
+            generator = torch.Generator(device=self._chunks.device).manual_seed(self.seed + start)
+            for part in episode.split(BATCH_SIZE):
+                history = self.replay.history(part, keys, self.teacher.n_obs_steps)
+                raw = self.teacher.sample(history, generator=generator)[:, : self.n_shared]
+                normalised = self.replay.memory.normaliser.normalise(ACTION, raw.to(self._chunks.device))
+                self._chunks[part] = 0.0
+                self._chunks[part, : self.n_shared] = normalised
+        self.seconds += time.perf_counter() - began
         logger.info(
-            "teacher chunks at %d recorded frames took %.1f s", len(rows), time.perf_counter() - start
+            "teacher chunks at %d recorded frames took %.1f s", len(rows), time.perf_counter() - began
         )

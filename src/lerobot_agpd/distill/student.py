@@ -6,10 +6,12 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import torch
 from lerobot.configs import PolicyFeature
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.utils.constants import OBS_PREFIX
 from lerobot.utils.feature_utils import dataset_to_policy_features
+from lerobot.utils.random_utils import seeded_context
 from torch import Tensor, nn
 
 from lerobot_agpd.distill.adversary import Discriminator
@@ -103,13 +105,9 @@ class DistilledStudent(nn.Module):
     def distillation(self) -> Distillation:
         """What trains this student; built when first needed, from what the constructor was given."""
         if self._distillation is None:
-            meta, stats = self._demonstrations
-            if meta is None:
-                raise ValueError(
-                    "the batch holds single frames, but the policy was built without dataset_meta and cannot cut "
-                    "chunks from memory; pass chunks (B, chunk_size, action_dim) or build it with make_policy"
-                )
-            self._distillation = Distillation(self, meta, stats)
+            seed = torch.initial_seed() % 2**32
+            with seeded_context(seed):  # loading a teacher draws numbers, which a resumed run must not notice
+                self._distillation = Distillation(self, *self._demonstrations, seed=seed)
         return self._distillation
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:

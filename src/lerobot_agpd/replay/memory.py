@@ -49,14 +49,22 @@ class FrameMemory:
         config: the policy's configuration (features and normalisation).
         dataset_meta: metadata of the training dataset, as `make_policy` passes it.
         dataset_stats: its statistics.
+
+    Raises:
+        ValueError: if the policy was built without a dataset.
     """
 
     def __init__(
         self,
         config: PreTrainedConfig,
-        dataset_meta: LeRobotDatasetMetadata,
+        dataset_meta: LeRobotDatasetMetadata | None,
         dataset_stats: Statistics | None = None,
     ):
+        if dataset_meta is None:
+            raise ValueError(
+                "the batch holds single frames, but the policy was built without dataset_meta and cannot cut chunks "
+                "from memory; pass chunks (B, steps, action_dim) or build the policy with make_policy"
+            )
         self.config = config
         self.keys = low_dimensional_keys(config)
         self.dataset = LeRobotDataset(

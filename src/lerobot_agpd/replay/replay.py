@@ -41,6 +41,7 @@ class Replay:
         self.collected_raw: FrameTable | None = None
         self.seen_episodes: set[int] = set()
         self._table: FrameTable | None = None
+        self._raw: FrameTable | None = None
         self._sources: list[tuple[int, LeRobotDataset]] = [(0, memory.dataset)]
         self._action_offsets = torch.arange(config.chunk_size)
         self._cameras = list(config.image_features)
@@ -70,9 +71,10 @@ class Replay:
     @property
     def raw(self) -> FrameTable:
         """All of T in the environment's units, on the CPU."""
-        if self.collected_raw is None:
-            return self.memory.table
-        return self.memory.table.concatenated(self.collected_raw)
+        if self._raw is None:
+            collected = self.collected_raw
+            self._raw = self.memory.table.concatenated(collected) if collected else self.memory.table
+        return self._raw
 
     def add_dataset(self, root: Path) -> None:
         """Append the episodes of a finished round's dataset."""
@@ -80,7 +82,7 @@ class Replay:
         frames = FrameTable.from_dataset(dataset, self.memory.keys)
         self._sources.append((self.n_demonstration_frames + self.n_collected_frames, dataset))
         self.collected_raw = frames if self.collected_raw is None else self.collected_raw.concatenated(frames)
-        self._table = None
+        self._table = self._raw = None
 
     # ---- rows ----
 

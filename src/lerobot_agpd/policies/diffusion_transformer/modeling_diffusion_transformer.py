@@ -71,13 +71,7 @@ class DiffusionTransformerPolicy(DiffusionPolicy):
 
     def _gather(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         if self._memory is None:
-            meta, stats = self._dataset
-            if meta is None:
-                raise ValueError(
-                    "the batch holds single frames, but the policy was built without dataset_meta and cannot "
-                    "cut chunks from memory; pass chunks (B, horizon, action_dim) or build it with make_policy"
-                )
-            self._memory = FrameMemory(self.config, meta, stats)
+            self._memory = FrameMemory(self.config, *self._dataset)
         self._memory.observe(batch)
         offsets = torch.as_tensor(self.config.chunk_offsets)
         return gather_rows(

@@ -1,4 +1,4 @@
-"""Train, kill, resume, evaluate and export on FetchReach, through LeRobot's own commands."""
+"""Train, kill, resume, evaluate and export on FetchPickAndPlace, through LeRobot's own commands."""
 
 import json
 import os
@@ -9,9 +9,11 @@ import time
 from pathlib import Path
 
 import pytest
-from commands import BIN, REACH, TINY_STUDENT, dataset_flags, environment, run, start
+import torch
+from commands import BIN, PICK, TINY_STUDENT, dataset_flags, environment, run, start
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors import safe_open
+from safetensors.torch import load_file
 
 pytestmark = pytest.mark.slow
 
@@ -34,17 +36,17 @@ def records(path: Path) -> list[dict]:
 
 
 def test_killed_run_is_resumed_evaluated_and_exported(
-    reach_demos: Path, reach_teacher: Path, tmp_path: Path
+    fetch_demos: Path, fetch_teacher: Path, tmp_path: Path
 ) -> None:
     teacher = tmp_path / "teacher"
-    shutil.copytree(reach_teacher, teacher)
+    shutil.copytree(fetch_teacher, teacher)
     first = tmp_path / "first"
     process = start(
         "lerobot-train",
         *TINY_STUDENT,
-        *REACH,
+        *PICK,
         *COLLECT,
-        *dataset_flags(reach_demos),
+        *dataset_flags(fetch_demos),
         f"--policy.teacher.path={teacher}",
         "--policy.representation.type=state",
         "--policy.representation.width=16",
@@ -95,7 +97,7 @@ def test_killed_run_is_resumed_evaluated_and_exported(
         "lerobot-eval",
         f"--policy.path={checkpoint}",
         "--policy.device=cpu",
-        *REACH,
+        *PICK,
         "--eval.n_episodes=2",
         "--eval.batch_size=2",
         "--eval.use_async_envs=true",
@@ -109,14 +111,48 @@ def test_killed_run_is_resumed_evaluated_and_exported(
         "import sys, torch\n"
         "from lerobot.policies.act.modeling_act import ACTPolicy\n"
         f"policy = ACTPolicy.from_pretrained({str(act)!r}, strict=True)\n"
-        "batch = {'observation.state': torch.ones(1, 10), 'observation.environment_state': torch.ones(1, 3)}\n"
+        "batch = {'observation.state': torch.ones(1, 10), 'observation.environment_state': torch.ones(1, 18)}\n"
         "assert policy.select_action(batch).shape == (1, 4)\n"
         "assert not any(name.startswith('lerobot_agpd') for name in sys.modules)\n"
     )
     subprocess.run([BIN / "python", "-c", load], check=True, env=environment())
 
 
-def test_two_processes_share_a_round(reach_demos: Path, reach_teacher: Path, tmp_path: Path) -> None:
+def test_resuming_changes_nothing(fetch_demos: Path, fetch_teacher: Path, tmp_path: Path) -> None:
+    """Weights at step 30 are the same, bit for bit, whether or not the run stopped at step 20.
+
+    Without ACT's own noise (VAE, dropout): starting a data loader draws from torch's generator, so LeRobot does
+    not resume noise exactly.
+    """
+    output = tmp_path / "run"
+    run(
+        "lerobot-train",
+        *TINY_STUDENT,
+        "--policy.use_vae=false",
+        "--policy.dropout=0",
+        *PICK,
+        *dataset_flags(fetch_demos),
+        f"--policy.teacher.path={fetch_teacher}",
+        "--policy.collect.warmup=10",
+        "--policy.collect.every=15",
+        "--policy.collect.episodes=6",
+        "--policy.adversary.start=5",
+        "--steps=30",
+        "--save_freq=20",
+        f"--output_dir={output}",
+    )
+    straight = load_file(output / "checkpoints" / "000030" / "pretrained_model" / "model.safetensors")
+    shutil.rmtree(output / "checkpoints" / "000030")
+    shutil.rmtree(output / "agpd" / "round-001")  # collected at step 25, after the checkpoint
+    (output / "agpd" / "manifest.json").unlink()
+    config = output / "checkpoints" / "000020" / "pretrained_model" / "train_config.json"
+    run("lerobot-train", f"--config_path={config}", "--resume=true")
+    resumed = load_file(output / "checkpoints" / "000030" / "pretrained_model" / "model.safetensors")
+    assert straight.keys() == resumed.keys()
+    assert [key for key in straight if not torch.equal(straight[key], resumed[key])] == []
+
+
+def test_two_processes_share_a_round(fetch_demos: Path, fetch_teacher: Path, tmp_path: Path) -> None:
     output = tmp_path / "run"
     run(
         "torchrun",
@@ -125,9 +161,9 @@ def test_two_processes_share_a_round(reach_demos: Path, reach_teacher: Path, tmp
         "-m",
         "lerobot.scripts.lerobot_train",
         *TINY_STUDENT,
-        *REACH,
-        *dataset_flags(reach_demos),
-        f"--policy.teacher.path={reach_teacher}",
+        *PICK,
+        *dataset_flags(fetch_demos),
+        f"--policy.teacher.path={fetch_teacher}",
         "--policy.collect.warmup=5",
         "--policy.collect.every=5",
         "--policy.collect.rounds=1",
@@ -147,15 +183,15 @@ def test_two_processes_share_a_round(reach_demos: Path, reach_teacher: Path, tmp
 
 
 def test_a_run_without_any_success_goes_on_cloning(
-    reach_demos: Path, reach_teacher: Path, tmp_path: Path
+    fetch_demos: Path, fetch_teacher: Path, tmp_path: Path
 ) -> None:
     output = run(
         "lerobot-train",
         *TINY_STUDENT,
-        *REACH,
+        *PICK,
         *COLLECT,
-        *dataset_flags(reach_demos),
-        f"--policy.teacher.path={reach_teacher}",
+        *dataset_flags(fetch_demos),
+        f"--policy.teacher.path={fetch_teacher}",
         "--policy.collect.min_reward=1",  # Fetch pays at most 0
         "--policy.collect.episodes=3",
         f"--output_dir={tmp_path / 'run'}",
