@@ -5,10 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from commands import TINY_STUDENT, TINY_TEACHER, dataset_flags, run
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import make_env
 from lerobot.envs.configs import PushtEnv
+
+from lerobot_agpd.collect.report import summarise
+from lerobot_agpd.collect.success import SuccessFilter
+from lerobot_agpd.replay.episode import Episode, Ticket
+from lerobot_agpd.replay.store import ReplayStore
+from lerobot_agpd.replay.writer import EpisodeWriter
 
 pytestmark = pytest.mark.slow
 
@@ -85,6 +92,32 @@ def test_cloning_and_asynchronous_evaluation(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "eval" / "eval_info.json").read_text())["overall"]["n_episodes"] == 2
 
 
+def finished_round(root: Path, demos: Path) -> int:
+    """A round of one kept episode, as collection leaves it; returns its length."""
+    dataset = LeRobotDataset("local/test", root=demos, episodes=[0])
+    frames = [dataset[step] for step in range(N_STEPS)]
+    images = [(frame["observation.image"] * 255).round().permute(1, 2, 0).numpy() for frame in frames]
+    episode = Episode(
+        ticket=Ticket(number=0, seed=1_000_000, scale=0.5),
+        task="push",
+        observations={
+            "observation.state": np.stack([frame["observation.state"].numpy() for frame in frames]),
+            "observation.image": np.stack(images).astype(np.uint8),
+        },
+        actions=np.stack([frame["action"].numpy() for frame in frames]),
+        rewards=np.linspace(0, 1, N_STEPS, dtype=np.float32),
+        successes=None,
+        j=0.1,
+        shift=0.1,
+    )
+    store = ReplayStore(root)
+    store.spool(0, 0).add(episode, SuccessFilter(min_reward=0.9, min_length=2).judge(episode))
+    store.write_share(0, 0, lambda path, kept: EpisodeWriter(dataset.meta).write(path, kept, 0, "guided"))
+    report = {"round": 0, "scale": 0.5, "next_scale": 0.5, "seconds": {}, **summarise(store.records(0, 1))}
+    store.finish(0, 1, report)
+    return N_STEPS
+
+
 def test_distillation_from_pixels(tmp_path: Path) -> None:
     """Images come from the loader for demonstrations and from the rounds' datasets for collected frames."""
     demos = record(tmp_path / "demos", pixels=True)
@@ -100,10 +133,11 @@ def test_distillation_from_pixels(tmp_path: Path) -> None:
         "--batch_size=8",
         "--policy.noise_samples_per_frame=1",
         *dataset_flags(demos),
-        "--steps=15",
+        "--steps=5",
         f"--output_dir={teacher}",
     )
-    output = tmp_path / "run"
+    rounds = tmp_path / "rounds"
+    assert finished_round(rounds, demos) == N_STEPS
     printed = run(
         "lerobot-train",
         *TINY_STUDENT,
@@ -111,21 +145,23 @@ def test_distillation_from_pixels(tmp_path: Path) -> None:
         *PIXELS,
         *dataset_flags(demos),
         f"--policy.teacher.path={teacher / 'checkpoints' / 'last' / 'pretrained_model'}",
-        "--policy.collect.warmup=3",
-        "--policy.collect.every=10",
-        "--policy.collect.rounds=1",
-        "--policy.collect.episodes=10",
-        "--policy.collect.min_reward=0.4",
+        f"--policy.replay.root={rounds}",
+        "--policy.collect.warmup=1",
+        "--policy.collect.every=2",
+        "--policy.collect.rounds=2",
+        "--policy.collect.episodes=3",
+        "--policy.collect.min_reward=0.9",
         "--policy.replay.collected_share=0.5",
         "--policy.adversary.start=2",
         "--batch_size=8",
         "--log_freq=1",
-        "--steps=6",
-        f"--output_dir={output}",
+        "--steps=5",
+        f"--output_dir={tmp_path / 'run'}",
     )
-    report = json.loads((output / "agpd" / "round-000" / "round.json").read_text())
-    assert report["generated"] == 10
-    assert report["kept"] > 0, [record["max_reward"] for record in report["episodes"]]
-    collected = LeRobotDataset("x", root=output / "agpd" / "round-000" / "rank-0")
-    assert collected[0]["observation.image"].shape == (3, 96, 96)
+    assert "replay holds 1 finished rounds" in printed
     assert "collected_share:0.500" in printed
+    report = json.loads((rounds / "round-001" / "round.json").read_text())
+    assert [record["length"] for record in report["episodes"]] == [N_STEPS] * 3
+    collected = LeRobotDataset("x", root=rounds / "round-000" / "rank-0")
+    original = LeRobotDataset("local/test", root=demos)
+    assert torch.equal(collected[7]["observation.image"], original[7]["observation.image"])
