@@ -55,9 +55,7 @@ class DiffusionTransformerConfig(DiffusionConfig):
     down_dims: tuple[int, ...] = (16,)
     crop_shape: tuple[int, int] | None = None
 
-    prediction_type: str = (
-        "sample"  # sample: the clean chunk; epsilon: the noise, which takes the MLP far longer to learn
-    )
+    prediction_type: str = "sample"  # sample: the clean chunk; epsilon: the noise
     denoiser: str = "mlp"  # network that predicts the noise (or the clean chunk)
     mlp: MLPDenoiserConfig = field(default_factory=MLPDenoiserConfig)
     ema: EMAConfig = field(default_factory=EMAConfig)
