@@ -77,6 +77,24 @@ def agpd_config(input_features, output_features):
     return build
 
 
+@pytest.fixture
+def agpd_diffusion_config(input_features, output_features):
+    """Builds configurations of a tiny diffusion student."""
+    from lerobot_agpd.policies.agpd_diffusion.configuration_agpd_diffusion import AGPDDiffusionConfig
+    from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
+        MLPDenoiserConfig,
+    )
+
+    def build(**options):
+        sizes = {"horizon": 8, "n_action_steps": 4, "drop_n_last_frames": 3, "num_inference_steps": 4}
+        network = {"denoiser": "mlp", "mlp": MLPDenoiserConfig(width=16, n_blocks=1, time_embed_dim=8)}
+        features = {"input_features": dict(input_features), "output_features": dict(output_features)}
+        common = {"noise_scheduler_type": "DDIM", "device": "cpu", "push_to_hub": False}
+        return AGPDDiffusionConfig(**{**sizes, **network, **features, **common, **options})
+
+    return build
+
+
 @pytest.fixture(autouse=True)
 def seeded():
     torch.manual_seed(0)

@@ -3,7 +3,9 @@
 import multiprocessing
 
 import lerobot_agpd.envs.gymnasium_robotics
+import lerobot_agpd.policies.act_diffusion.configuration_act_diffusion
 import lerobot_agpd.policies.agpd.configuration_agpd
+import lerobot_agpd.policies.agpd_diffusion.configuration_agpd_diffusion
 import lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer  # noqa: F401
 
 FORKSERVER_PRELOAD = ["lerobot_agpd.envs.workers", "gymnasium_robotics"]

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
+from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_agpd.cli import demos
 from lerobot_agpd.cli.demos import DemosConfig, DemosReport, record_demos, successful_episodes
 from lerobot_agpd.envs.experts import fetch_reach_expert
-from lerobot_agpd.envs.gymnasium_robotics import TASKS, GymnasiumRoboticsEnv
+from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
+from lerobot_agpd.envs.robotics_tasks import TASKS
 
 pytest.importorskip("gymnasium_robotics")
 
@@ -58,12 +60,13 @@ def test_dataset_has_the_declared_contents(recorded):
     assert recorded[0]["next.reward"].item() == -1 and not recorded[0]["next.success"].item()
 
 
-def test_replayed_actions_repeat_the_episode(recorded):
-    seeds = json.loads((recorded.root / demos.REPORT_PATH).read_text())["seeds"]
-    assert len(seeds) == 2 and seeds[0] >= 40
-    frames = [recorded[i] for i in range(recorded.num_frames)]
+def assert_replay_repeats(dataset: LeRobotDataset, episode_length: int) -> None:
+    """Play the recorded actions from the recorded seeds and compare everything that the environment delivers."""
+    seeds = json.loads((dataset.root / demos.REPORT_PATH).read_text())["seeds"]
+    assert len(seeds) == dataset.num_episodes
+    frames = [dataset[i] for i in range(dataset.num_frames)]
+    env = GymnasiumRoboticsEnv(task=REACH, episode_length=episode_length).make_single()
     for episode, seed in enumerate(seeds):
-        env = GymnasiumRoboticsEnv(task=REACH, episode_length=12).make_single()
         observation, _ = env.reset(seed=seed)
         for frame in (frame for frame in frames if frame["episode_index"] == episode):
             np.testing.assert_array_equal(observation["agent_pos"], frame["observation.state"])
@@ -75,6 +78,80 @@ def test_replayed_actions_repeat_the_episode(recorded):
             assert reward == frame["next.reward"].item()
             assert (terminated or truncated) == frame["next.done"].item()
         assert info["is_success"]
+
+
+def test_replayed_actions_repeat_the_episode(recorded):
+    assert json.loads((recorded.root / demos.REPORT_PATH).read_text())["seeds"][0] >= 40
+    assert_replay_repeats(recorded, episode_length=12)
+
+
+def test_the_expert_alone_needs_no_skill_column(recorded):
+    assert "skill" not in recorded.features
+
+
+@pytest.fixture(scope="module")
+def mixture(tmp_path_factory) -> LeRobotDataset:
+    """Five episodes of two operators in turn, recorded through the console command."""
+    root = tmp_path_factory.mktemp("mixture") / "reach"
+    argv = ["lerobot-agpd-demos", f"--env.task={REACH}", "--env.type=gymnasium_robotics"]
+    argv += ["--env.episode_length=30", "--episodes=5", "--skill=[1,0.25]", f"--root={root}"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", argv)
+        demos.main()
+    return LeRobotDataset("local/demos", root=root)
+
+
+def test_operators_take_turns_and_their_skill_is_recorded(mixture):
+    assert mixture.num_episodes == 5
+    by_episode = {int(mixture[i]["episode_index"]): mixture[i]["skill"].item() for i in range(0, 150, 10)}
+    assert by_episode == {0: 1.0, 1: 0.25, 2: 1.0, 3: 0.25, 4: 1.0}
+    assert json.loads((mixture.root / demos.REPORT_PATH).read_text())["skills"] == [1.0, 0.25, 1.0, 0.25, 1.0]
+
+
+def test_no_policy_reads_the_skill(mixture):
+    assert "skill" not in dataset_to_policy_features(mixture.meta.features)
+
+
+def test_replayed_actions_repeat_episodes_of_any_skill(mixture):
+    assert_replay_repeats(mixture, episode_length=30)
+
+
+def test_less_skill_means_longer_ways(mixture):
+    frames = [mixture[i] for i in range(mixture.num_frames)]
+
+    def wobble(skill: float) -> float:
+        actions = np.stack([f["action"].numpy() for f in frames if f["skill"].item() == skill])
+        return float(np.abs(np.diff(actions, axis=0)).mean())
+
+    assert wobble(0.25) > 2 * wobble(1.0)
+
+
+def test_images_are_recorded_where_they_are_observed(tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    try:
+        mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
+    except Exception as error:  # whatever the graphics library raises
+        pytest.skip(f"no graphics context (is MUJOCO_GL set?): {error}")
+    env = GymnasiumRoboticsEnv(
+        task=REACH,
+        episode_length=12,
+        obs_type="pixels_agent_pos",
+        observation_height=24,
+        observation_width=32,
+    )
+    record_demos(DemosConfig(root=tmp_path / "x", env=env, episodes=1))
+    dataset = LeRobotDataset("local/demos", root=tmp_path / "x")
+    assert dataset.num_frames == 12
+    assert dataset[0]["observation.image"].shape == (3, 24, 32)
+    assert "observation.environment_state" not in dataset.features
+
+
+def test_report_counts_per_skill():
+    report = DemosReport(task=REACH, seeds=[0, 1, 2], skills=[1.0, 0.5, 1.0])
+    report.failed_seeds, report.failed_skills = [3, 4, 5], [0.5, 0.5, 0.5]
+    assert (report.success_rate_of(1.0), report.success_rate_of(0.5)) == (1.0, 0.25)
+    cells = [cell for column in report.to_table().columns for cell in column.cells]
+    assert "0.250 (1 recorded, 3 failed)" in cells
 
 
 def test_trivial_starts_and_failures_are_left_out_and_counted(tmp_path):
@@ -137,6 +214,9 @@ def test_other_requests_that_cannot_work_are_refused(tmp_path):
         reach_config(tmp_path / "x", episodes=0)
     with pytest.raises(ValueError, match="pusht"):
         DemosConfig(root=tmp_path / "x", env=EnvConfig.get_choice_class("pusht")())
+    for skill in (1.5, -0.1, [], [1.0, 2.0]):
+        with pytest.raises(ValueError, match="--skill=.* must be one or several numbers"):
+            reach_config(tmp_path / "x", skill=skill)
     slide = DemosConfig(root=tmp_path / "x", env=GymnasiumRoboticsEnv(task="FetchSlide-v4"))
     with pytest.raises(ValueError, match="No scripted expert"):
         record_demos(slide)

@@ -9,9 +9,11 @@ import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import PushtEnv
+from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_agpd.cli import viz
+from lerobot_agpd.distill.loading import load_student
 from lerobot_agpd.guidance.config import TeacherConfig
 from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
@@ -168,8 +170,8 @@ def test_guidance_pulls_toward_the_student_from_the_same_noise(
 def test_student_chunk_is_what_the_policy_executes(monkeypatch, student):
     config = make_config(monkeypatch, student, render=False)
     ((episode, rollout),) = rollouts(config, scale=0.0)
-    loaded = viz.load_student(config.policy)
-    preprocessor, postprocessor = viz.make_pre_post_processors(config.policy, pretrained_path=str(student))
+    loaded = load_student(config.policy)
+    preprocessor, postprocessor = make_pre_post_processors(config.policy, pretrained_path=str(student))
     observation = {key: torch.from_numpy(episode.observations[key][0]) for key in INPUTS}
     chunk = loaded.student.predict_action_chunk(preprocessor(observation))[:, :N_STEPS]
     np.testing.assert_allclose(rollout.decisions[0].chunks.student, postprocessor(chunk)[0], rtol=1e-5)
@@ -190,7 +192,7 @@ def test_scale_is_given_or_the_runs_or_the_policys(monkeypatch, student, tmp_pat
 def test_teacher_flags_override_the_checkpoints(monkeypatch, student, teacher):
     config = make_config(monkeypatch, student, teacher=TeacherConfig(num_inference_steps=3))
     guided = viz.make_guided_teacher(config)
-    assert guided.teacher.policy.diffusion.num_inference_steps == 3
+    assert guided.pair.teacher.policy.diffusion.num_inference_steps == 3
     config = make_config(monkeypatch, student, teacher=TeacherConfig(path="nowhere/to/be/found"))
     with pytest.raises(FileNotFoundError, match="nowhere/to/be/found"):
         viz.make_guided_teacher(config)

@@ -6,7 +6,9 @@ from lerobot_agpd.replay.episode import EpisodeRecord
 NAN = float("nan")
 
 
-def record(scale=1.0, passed=True, trivial=False, length=10, reward=1.0, j=NAN, shift=NAN) -> EpisodeRecord:
+def record(
+    scale=1.0, passed=True, trivial=False, length=10, reward=1.0, j=NAN, shift=NAN, **options
+) -> EpisodeRecord:
     return EpisodeRecord(
         number=0,
         seed=1,
@@ -19,6 +21,7 @@ def record(scale=1.0, passed=True, trivial=False, length=10, reward=1.0, j=NAN, 
         kept=passed and not trivial,
         j=j,
         shift=shift,
+        **options,
     )
 
 
@@ -57,3 +60,17 @@ def test_summary_by_hand():
     assert summary["kept_frames"] == 60
     assert len(summary["episodes"]) == 7 and summary["episodes"][2]["j"] is None
     assert summarise([])["mean_max_reward"] is None
+
+
+def test_episodes_of_the_student_alone_are_counted_apart():
+    alone = [
+        record(student_alone=True, student_steps=10),
+        record(scale=0.0, student_alone=True, passed=False),
+    ]
+    kept = record(student_steps=4), record(scale=0.0, student_steps=8)
+    summary = summarise([*alone, *kept])
+    assert summary["generated"] == 4
+    assert summary["student_alone"] == {"generated": 2, "trivial": 0, "successful": 1, "kept": 1}
+    assert summary["guided"]["generated"] == summary["unguided"]["generated"] == 1
+    assert summary["mean_student_steps"] == 6.0  # where the teacher took over
+    assert summarise(RECORDS)["student_alone"]["generated"] == 0

@@ -6,7 +6,10 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from lerobot_agpd.collect.rollout import Decision, Rollouts, Stopwatch
+from lerobot_agpd.collect.config import RollinConfig
+from lerobot_agpd.collect.decider import Decision
+from lerobot_agpd.collect.rollout import Rollouts, step_limit
+from lerobot_agpd.collect.stopwatch import Stopwatch
 from lerobot_agpd.replay.episode import Ticket
 
 NAME = "lerobot_agpd_tests/Countdown-v0"
@@ -64,9 +67,11 @@ class Decider:
 
     def __init__(self, broken_seed=None):
         self.broken_seed = broken_seed
+        self.stopwatch = Stopwatch()
         self.decisions = []
 
-    def decide(self, history, scale):
+    def decide(self, history, scale, rolling_in=None):
+        assert history["task"] == ["count down"] * len(scale)
         state = history["observation.state"]  # (B, 2, 2)
         assert state.shape[1:] == (2, 2) and history["observation.environment_state"].shape[1:] == (2, 1)
         self.decisions.append((state.clone(), scale.clone()))
@@ -90,9 +95,9 @@ class Counting(SyncVectorEnv):
         return super().reset(**options)
 
 
-def rollouts(n_envs, decider, make=lambda: gym.make(NAME)) -> Rollouts:
+def rollouts(n_envs, decider, make=lambda: gym.make(NAME), rollin=None) -> Rollouts:
     envs = Counting([make] * n_envs, autoreset_mode=AutoresetMode.SAME_STEP)
-    return Rollouts(envs, (lambda x: x, lambda x: x), decider, Stopwatch())
+    return Rollouts(envs, (lambda x: x, lambda x: x), decider, rollin)
 
 
 def tickets(lengths):
@@ -131,6 +136,7 @@ def test_every_ticket_yields_its_episode(n_envs):
         np.testing.assert_allclose(episode.rewards, rewards, rtol=1e-6)
         assert episode.successes.tolist() == [False] * (len(episode) - 1) + [episode.ticket.seed % 2 == 1]
         assert episode.task == "count down"
+        assert episode.student_steps == 0 and not episode.student_alone
         clocks = range(0, len(episode), N_STEPS)
         assert episode.j == pytest.approx(np.mean(clocks))
         assert episode.shift == pytest.approx(
@@ -181,15 +187,15 @@ def test_decisions_run_without_gradients_and_time_is_taken():
     seen = []
 
     class Watching(Decider):
-        def decide(self, history, scale):
+        def decide(self, history, scale, rolling_in=None):
             seen.append(torch.is_grad_enabled())
-            return super().decide(history, scale)
+            return super().decide(history, scale, rolling_in)
 
     run = rollouts(1, Watching())
     list(run.run(tickets([3])))
     assert seen == [False, False] and torch.is_grad_enabled()
-    assert set(run.stopwatch.seconds) == {"decisions", "environment"}
-    assert all(seconds > 0 for seconds in run.stopwatch.seconds.values())
+    assert set(run.decider.stopwatch.seconds) == {"environment"}
+    assert run.decider.stopwatch.seconds["environment"] > 0
 
 
 def test_diverged_chunk_is_refused_before_it_is_executed():
@@ -208,3 +214,104 @@ def test_environment_that_does_not_report_success():
 def test_no_tickets_no_steps():
     run = rollouts(2, Decider())
     assert list(run.run([])) == [] and run.envs.n_steps == run.envs.n_resets == 0
+
+
+# ---- what is recorded ----
+
+
+class Relabelling(Decider):
+    """Executes what its base does and records the negative of it."""
+
+    def decide(self, history, scale, rolling_in=None):
+        decision = super().decide(history, scale)
+        return Decision(decision.actions, decision.j, decision.shift, recorded=-decision.actions)
+
+
+def test_relabelled_actions_are_recorded_and_not_executed():
+    (plain,), (relabelled,) = (
+        rollouts(1, decider).run(tickets([5])) for decider in (Decider(), Relabelling())
+    )
+    np.testing.assert_array_equal(relabelled.actions, -plain.actions)
+    np.testing.assert_array_equal(relabelled.rewards, plain.rewards)
+    np.testing.assert_array_equal(
+        relabelled.observations["observation.environment_state"],
+        plain.observations["observation.environment_state"],
+    )
+
+
+def test_both_kinds_of_actions_pass_the_environments_postprocessor():
+    run = rollouts(1, Relabelling())
+    run.postprocess = lambda transition: {"action": transition["action"] + 1000}
+    (episode,), (plain,) = run.run(tickets([1])), rollouts(1, Decider()).run(tickets([1]))
+    assert episode.actions.tolist() == (1000 - plain.actions).tolist()
+    assert episode.rewards.tolist() == (plain.rewards + 10_000).tolist()
+
+
+# ---- roll-in ----
+
+
+class Relay(Decider):
+    """The student executes -1 and the teacher what its base does; remembers who decided."""
+
+    def decide(self, history, scale, rolling_in=None):
+        decision = super().decide(history, scale)
+        actions, j = decision.actions.clone(), decision.j.clone()
+        actions[rolling_in], j[rolling_in] = -1.0, float("nan")
+        return Decision(actions, j, decision.shift)
+
+
+def rolled_in(share, record_student=False, episode_steps=10, length=7):
+    """One episode of `length` steps; seed 100 * length + 1 succeeds."""
+    rollin = RollinConfig(episode_steps=episode_steps, record_student=record_student)
+    ticket = Ticket(0, 100 * length + 1, 1.5, share)
+    (episode,) = rollouts(1, Relay(), rollin=rollin).run([ticket])
+    return episode
+
+
+@pytest.mark.parametrize(
+    ("share", "takeover"),
+    [(0.0, 0), (0.04, 0), (0.1, 2), (0.2, 2), (0.3, 4), (0.6, 6)],  # of 10 steps, in decisions of two
+)
+def test_only_the_teachers_part_is_recorded(share, takeover):
+    episode = rolled_in(share)
+    whole = rolled_in(share, record_student=True)
+    for part in (episode, whole):
+        assert part.student_steps == takeover and not part.student_alone
+        assert part.success
+    assert len(whole) == 7 and len(episode) == 7 - takeover
+    assert (whole.actions[:takeover] == -1).all() and (whole.actions[takeover:] > 0).all()
+    np.testing.assert_array_equal(episode.actions, whole.actions[takeover:])
+    np.testing.assert_array_equal(episode.rewards, whole.rewards[takeover:])
+    np.testing.assert_array_equal(episode.successes, whole.successes[takeover:])
+    states = episode.observations["observation.state"]
+    assert states[:, 1].tolist() == list(range(takeover, 7))
+    assert episode.j == np.mean(range(takeover, 7, N_STEPS))  # of the teacher's decisions
+
+
+@pytest.mark.parametrize("record_student", [False, True])
+def test_student_that_finishes_alone(record_student):
+    episode = rolled_in(0.9, record_student)
+    assert episode.student_alone and episode.student_steps == len(episode) == 7
+    assert (episode.actions == -1).all() and np.isnan(episode.j) and episode.success
+
+
+def test_slots_take_over_each_at_its_own_step():
+    asked = [Ticket(n, 601 + n, 1.5, share) for n, share in enumerate((0.0, 0.2, 0.5, 0.9, 0.4))]
+    run = rollouts(2, Relay(), rollin=RollinConfig(episode_steps=10))
+    found = {episode.ticket.number: episode.student_steps for episode in run.run(asked)}
+    assert found == {0: 0, 1: 2, 2: 6, 3: 6, 4: 4}
+
+
+def test_share_is_of_the_environments_own_limit():
+    def limited():
+        return gym.make(NAME, max_episode_steps=4)
+
+    assert step_limit(rollouts(2, Decider(), make=limited).envs) == 4
+    (episode,) = rollouts(1, Relay(), make=limited).run([Ticket(0, 701, 1.5, 0.5)])
+    assert episode.student_steps == 2 and len(episode) == 2
+
+
+def test_environment_without_a_limit_is_refused():
+    with pytest.raises(ValueError, match="--policy.collect.rollin.episode_steps"):
+        list(rollouts(1, Relay()).run([Ticket(0, 701, 1.5, 0.5)]))
+    assert len(list(rollouts(1, Relay()).run([Ticket(0, 701, 1.5, 0.0)]))) == 1  # nobody asks

@@ -1,5 +1,7 @@
+import numpy as np
 import pytest
 from hypothesis import given, strategies as st
+from scipy.stats import kstest
 
 from lerobot_agpd.collect.config import COLLECTION_SEEDS, EVALUATION_SEEDS
 from lerobot_agpd.collect.seeds import noise_seed, round_tickets, share_of
@@ -71,3 +73,36 @@ def test_unguided_share_survives_being_split_over_processes(episodes, n_ranks):
 def test_property_shares_add_up(n, n_ranks):
     shares = [share_of(n, rank, n_ranks) for rank in range(n_ranks)]
     assert sum(shares) == n and max(shares) - min(shares) <= 1
+
+
+def varied(n=2000, scale=2.0, **options):
+    return round_tickets(n, 1000, 0, 1, 0, scale, 0.2, **options)
+
+
+def test_without_variation_nothing_varies():
+    assert all(ticket.scale in (0.0, 2.0) and ticket.student_share == 0 for ticket in varied())
+
+
+def test_scales_are_log_uniform_around_the_rounds():
+    drawn = varied(scale_spread=3.0)
+    spread = np.log([ticket.scale / 2.0 for ticket in drawn if ticket.guided]) / np.log(3.0)
+    assert len(spread) == 1600 and all(ticket.scale == 0 for ticket in drawn if not ticket.guided)
+    assert kstest(spread, "uniform", args=(-1, 2)).pvalue > 0.01
+    assert [t.seed for t in drawn] == [t.seed for t in varied()]
+
+
+def test_students_shares_are_uniform_with_and_without_guidance():
+    drawn = varied(max_student_share=0.6)
+    for guided in (True, False):
+        shares = [ticket.student_share / 0.6 for ticket in drawn if ticket.guided is guided]
+        assert kstest(shares, "uniform").pvalue > 0.01
+
+
+def test_variation_belongs_to_the_ticket():
+    """It hangs on the ticket's own seed: neither on the rest of the round nor on the guidance scale."""
+    options = {"scale_spread": 3.0, "max_student_share": 0.5}
+    small, large = varied(5, scale=1.0, **options), varied(50, scale=8.0, **options)
+    for ours, theirs in zip(small, large, strict=False):
+        assert ours.student_share == theirs.student_share
+        assert 8 * ours.scale == pytest.approx(theirs.scale)
+    assert varied(50, scale=8.0, **options) == large

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -60,6 +62,13 @@ def test_record_copies_the_episode():
     record = SuccessFilter(None, 2).judge(episode([0.5, 2.0, 1.0], [0, 0, 1]))
     assert (record.number, record.seed, record.scale, record.length) == (3, 1_000_007, 0.5, 3)
     assert (record.max_reward, record.j, record.shift) == (2.0, 0.25, 0.75)
+
+
+def test_what_the_student_finishes_alone_is_counted_and_not_kept():
+    alone = replace(episode([0.5, 2.0, 1.0], [0, 0, 1]), student_alone=True, student_steps=3)
+    record = SuccessFilter(None, 2).judge(alone)
+    assert record.passed and not record.trivial and not record.kept
+    assert record.student_alone and record.student_steps == 3
 
 
 def test_silent_environment_is_refused():

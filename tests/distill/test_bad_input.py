@@ -1,7 +1,5 @@
 """What a user can get wrong, and whether the error names the flag, what was found and what would be right."""
 
-from pathlib import Path
-
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
@@ -13,39 +11,9 @@ from lerobot_agpd.collect.config import CollectConfig
 from lerobot_agpd.distill.environment import check_environment_fits, run_environment
 from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
 from lerobot_agpd.guidance.config import GuidanceConfig, TeacherConfig
-from lerobot_agpd.guidance.teacher import load_teacher
+from lerobot_agpd.guidance.loading import load_teacher
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
-from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
-    DiffusionTransformerConfig,
-    MLPDenoiserConfig,
-)
-from lerobot_agpd.policies.diffusion_transformer.modeling_diffusion_transformer import (
-    DiffusionTransformerPolicy,
-)
 from lerobot_agpd.run import RunInfo, declared_run
-
-
-@pytest.fixture
-def save_teacher(tmp_path, demonstrations, input_features, output_features):
-    """Writes a random teacher with its processors; features can be exchanged."""
-
-    def save(inputs=None, outputs=None) -> Path:
-        config = DiffusionTransformerConfig(
-            input_features=inputs or dict(input_features),
-            output_features=outputs or dict(output_features),
-            mlp=MLPDenoiserConfig(width=8, n_blocks=1, time_embed_dim=4),
-            num_inference_steps=2,
-            noise_scheduler_type="DDIM",
-            device="cpu",
-            push_to_hub=False,
-        )
-        folder = tmp_path / "teacher"
-        DiffusionTransformerPolicy(config).save_pretrained(folder)
-        for processor in make_pre_post_processors(config, dataset_stats=demonstrations.meta.stats):
-            processor.save_pretrained(folder)
-        return folder
-
-    return save
 
 
 def train_step(config, dataset: LeRobotDataset, run: RunInfo) -> None:
@@ -67,10 +35,14 @@ def test_teacher_path_without_a_policy(tmp_path):
         load_teacher(TeacherConfig(path=str(tmp_path)), "cpu")
 
 
-def test_teacher_that_does_not_denoise(tmp_path, agpd_config):
-    AGPDPolicy(agpd_config()).save_pretrained(tmp_path / "act")
-    with pytest.raises(ValueError, match="is a 'agpd' policy.*'diffusion'"):
-        load_teacher(TeacherConfig(path=str(tmp_path / "act")), "cpu")
+def test_guiding_a_teacher_that_does_not_denoise(tmp_path, agpd_config, demonstrations):
+    config = agpd_config()
+    AGPDPolicy(config).save_pretrained(tmp_path / "act")
+    for processor in make_pre_post_processors(config, dataset_stats=demonstrations.meta.stats):
+        processor.save_pretrained(tmp_path / "act")
+    config = agpd_config(teacher=TeacherConfig(path=str(tmp_path / "act")))
+    with pytest.raises(ValueError, match=r"'agpd' teacher .*no denoising to guide.*strategy=replay"):
+        train_step(config, demonstrations, RunInfo(env=PushtEnv()))
 
 
 def test_teacher_with_other_observations(agpd_config, demonstrations, save_teacher, input_features):

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
 
+from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE
 from lerobot_agpd.envs.experts import (
     CLOSE,
     EXPERTS,
@@ -14,7 +15,8 @@ from lerobot_agpd.envs.experts import (
     fetch_reach_expert,
     make_expert,
 )
-from lerobot_agpd.envs.gymnasium_robotics import AGENT_POS, ENVIRONMENT_STATE, TASKS, GymnasiumRoboticsEnv
+from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
+from lerobot_agpd.envs.robotics_tasks import TASKS
 
 
 def scene(

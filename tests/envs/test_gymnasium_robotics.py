@@ -13,24 +13,13 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from lerobot.envs import EnvConfig, make_env, preprocess_observation
 from lerobot.envs.utils import check_env_attributes_and_types, env_to_policy_features
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE
 
-from lerobot_agpd.envs.gymnasium_robotics import (
-    AGENT_POS,
-    ENVIRONMENT_STATE,
-    TASKS,
-    GymnasiumRoboticsEnv,
-    ObservationLayout,
-)
+from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE
+from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
+from lerobot_agpd.envs.robotics_tasks import KITCHEN, KITCHEN_DEFAULT, TASKS
 
 pytest.importorskip("gymnasium_robotics")
-
-ENVIRONMENT_STATE_DIM = {
-    "FetchReach-v4": 3,
-    "FetchPush-v4": 18,
-    "FetchPickAndPlace-v4": 18,
-    "FetchSlide-v4": 18,
-}
 
 
 @dataclass
@@ -46,7 +35,8 @@ def make_vector_env(config: GymnasiumRoboticsEnv, n_envs: int = 2, use_async_env
 
 def roll(env: gym.Env, seed: int, n_steps: int = 20) -> tuple[np.ndarray, list[bool]]:
     """Observations (n_steps + 1, D) and successes under random actions that depend on the seed only."""
-    actions = np.random.default_rng(seed).uniform(-1, 1, size=(n_steps, 4)).astype(np.float32)
+    size = (n_steps, *env.action_space.shape)
+    actions = np.random.default_rng(seed).uniform(-1, 1, size=size).astype(np.float32)
     observation, info = env.reset(seed=seed)
     observations, successes = [observation], [info["is_success"]]
     for action in actions:
@@ -56,45 +46,33 @@ def roll(env: gym.Env, seed: int, n_steps: int = 20) -> tuple[np.ndarray, list[b
     return np.stack([np.concatenate([o[AGENT_POS], o[ENVIRONMENT_STATE]]) for o in observations]), successes
 
 
-def test_layout_splits_by_index_and_appends_the_goal():
-    layout = ObservationLayout(agent_pos=(0, 3), environment_state=(2,), goal_dim=1)
-    split = layout.split({"observation": np.arange(4.0), "desired_goal": np.array([9.0])})
-    np.testing.assert_array_equal(split[AGENT_POS], np.float32([0, 3]))
-    np.testing.assert_array_equal(split[ENVIRONMENT_STATE], np.float32([2, 9]))
-    assert split[AGENT_POS].dtype == split[ENVIRONMENT_STATE].dtype == np.float32
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_split_observation_holds_what_its_names_say(task):
-    env = GymnasiumRoboticsEnv(task=task).make_single()
-    observation, _ = env.reset(seed=3)
-    raw = env.unwrapped
-    assert observation[AGENT_POS].shape == (10,)
-    assert observation[ENVIRONMENT_STATE].shape == (ENVIRONMENT_STATE_DIM[task],)
-    grip = raw._utils.get_site_xpos(raw.model, raw.data, "robot0:grip")
-    np.testing.assert_allclose(observation[AGENT_POS][:3], grip, rtol=1e-6)
-    np.testing.assert_allclose(observation[ENVIRONMENT_STATE][-3:], raw.goal, rtol=1e-6)
-    if raw.has_object:
-        block = raw._utils.get_site_xpos(raw.model, raw.data, "object0")
-        np.testing.assert_allclose(observation[ENVIRONMENT_STATE][:3], block, rtol=1e-6)
-        np.testing.assert_allclose(observation[ENVIRONMENT_STATE][3:6], block - grip, atol=1e-6)
-
-
 @pytest.mark.parametrize("task", TASKS)
 def test_gymnasium_env_checker_accepts_it(task):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # unbounded observations, and being wrapped at all
-        check_env(GymnasiumRoboticsEnv(task=task).make_single(), skip_render_check=True)
+        (env,) = make_vector_env(GymnasiumRoboticsEnv(task=task), n_envs=1).envs
+        check_env(env, skip_render_check=True)
 
 
+def test_gymnasium_env_checker_accepts_pixels(rendering):
+    config = GymnasiumRoboticsEnv(obs_type="pixels_agent_pos", observation_height=32, observation_width=32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        vector_env = make_vector_env(config, n_envs=1)
+        check_env(vector_env.envs[0], skip_render_check=True)
+        vector_env.close()
+
+
+@pytest.mark.parametrize("task", ["FetchPickAndPlace-v4", "AdroitHandPen-v1", KITCHEN])
 @pytest.mark.parametrize("use_async_envs", [False, True], ids=["sync", "async"])
-def test_vector_env_agrees_with_the_declared_features(use_async_envs):
-    config = GymnasiumRoboticsEnv(episode_length=3)
+def test_vector_env_agrees_with_the_declared_features(use_async_envs, task):
+    config = GymnasiumRoboticsEnv(task=task, episode_length=3)
     env = make_vector_env(config, use_async_envs=use_async_envs)
     try:
         assert type(env) is (AsyncVectorEnv if use_async_envs else SyncVectorEnv)
         assert env.call("_max_episode_steps") == (3, 3)
-        assert env.call("task_description") == (TASKS[config.task].description,) * 2
+        descriptions = env.call("task_description")
+        assert len(descriptions) == 2 and all(descriptions)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             check_env_attributes_and_types(env)
@@ -122,7 +100,24 @@ def test_vector_env_agrees_with_the_declared_features(use_async_envs):
         env.close()
 
 
-@pytest.mark.parametrize("task", ["FetchReach-v4", "FetchPickAndPlace-v4"])
+def test_vector_env_of_pixels_agrees_with_the_declared_features(rendering):
+    config = GymnasiumRoboticsEnv(
+        task="FetchReach-v4", obs_type="pixels_agent_pos", observation_height=48, observation_width=64
+    )
+    env = make_vector_env(config, use_async_envs=True)
+    try:
+        observation, _ = env.reset(seed=[5, 6])
+        features = env_to_policy_features(config)
+        assert set(features) == {ACTION, OBS_STATE, OBS_IMAGE}
+        batch = preprocess_observation(observation)
+        assert features[OBS_IMAGE].shape == tuple(batch[OBS_IMAGE].shape[1:]) == (3, 48, 64)
+        assert not np.array_equal(*observation["pixels"])
+        assert [frame.shape for frame in env.call("render")] == [(480, 480, 3)] * 2
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize("task", ["FetchReach-v4", "FetchPickAndPlace-v4", "AdroitHandHammer-v1", KITCHEN])
 def test_seed_determines_the_episode_also_in_a_used_env(task):
     config = GymnasiumRoboticsEnv(task=task)
     used = config.make_single()
@@ -135,25 +130,6 @@ def test_seed_determines_the_episode_also_in_a_used_env(task):
     assert not np.array_equal(first, other)
 
 
-def test_success_is_a_bool_and_means_within_five_centimetres():
-    config = GymnasiumRoboticsEnv(task="FetchReach-v4")
-    env = config.make_single()
-    seen = set()
-    for seed in range(30):
-        observations, successes = roll(env, seed, n_steps=5)
-        distances = np.linalg.norm(observations[:, :3] - observations[:, -3:], axis=1)
-        assert all(type(success) is bool for success in successes)
-        assert successes == (distances < 0.05).tolist()
-        seen.update(successes)
-    assert seen == {True, False}
-
-
-def test_no_renderer_is_opened_unless_asked_for():
-    env = GymnasiumRoboticsEnv().make_single()
-    roll(env, seed=0)
-    assert env.unwrapped.mujoco_renderer.viewer is None
-
-
 def test_command_line_and_round_trip():
     argv = ["--env.type=gymnasium_robotics", "--env.task=FetchPush-v4", "--env.episode_length=7"]
     config = draccus.parse(Command, args=argv).env
@@ -163,11 +139,24 @@ def test_command_line_and_round_trip():
     assert pickle.loads(pickle.dumps(config)) == config
 
 
+def test_defaults_follow_the_task():
+    fetch, kitchen = GymnasiumRoboticsEnv(), GymnasiumRoboticsEnv(task=KITCHEN)
+    assert (fetch.fps, fetch.episode_length, fetch.tasks_to_complete) == (25, 50, None)
+    assert (kitchen.fps, kitchen.episode_length) == (12, 280)
+    assert kitchen.tasks_to_complete == list(KITCHEN_DEFAULT)
+    argv = ["--env.type=gymnasium_robotics", f"--env.task={KITCHEN}", "--env.tasks_to_complete=[kettle]"]
+    assert draccus.parse(Command, args=argv).env.gym_kwargs["tasks_to_complete"] == ["kettle"]
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"task": "FetchDance-v4"}, "FetchDance-v4.*Known tasks: FetchReach-v4, FetchPush-v4"),
-        ({"obs_type": "pixels"}, "obs_type"),
+        ({"obs_type": "depth"}, "obs_type must be one of state, pixels, pixels_agent_pos; got 'depth'"),
+        ({"observation_width": 0}, "observation_width=0"),
+        ({"tasks_to_complete": ["kettle"]}, "belongs to FrankaKitchen-v1, not to FetchPickAndPlace-v4"),
+        ({"task": KITCHEN, "tasks_to_complete": ["laundry"]}, "laundry.*bottom burner"),
+        ({"task": KITCHEN, "tasks_to_complete": []}, "at least one of"),
         ({"fps": 30}, "25 steps per second"),
         ({"episode_length": 0}, "episode_length"),
     ],

@@ -5,41 +5,52 @@ import json
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
-from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
+from lerobot.datasets.factory import resolve_delta_timestamps
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
+from lerobot.policies import make_policy as make_lerobot_policy, make_pre_post_processors
+from lerobot.policies.diffusion.modeling_diffusion import DiffusionConditionalUnet1d, DiffusionPolicy
 from safetensors.torch import load_file
+from torch.utils.data import default_collate
 
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
     DiffusionTransformerConfig,
     EMAConfig,
     MLPDenoiserConfig,
+    TransformerDenoiserConfig,
 )
 from lerobot_agpd.policies.diffusion_transformer.denoisers import MLPDenoiser
 from lerobot_agpd.policies.diffusion_transformer.modeling_diffusion_transformer import (
     RAW_WEIGHTS,
     DiffusionTransformerPolicy,
 )
+from lerobot_agpd.policies.diffusion_transformer.transformer import TransformerDenoiser
 from lerobot_agpd.run import RunInfo, declared_run
 
 B = 4
+DENOISERS = {
+    "mlp": {"denoiser": "mlp"},
+    "transformer": {"denoiser": "transformer"},
+    "unet": {"denoiser": "unet", "down_dims": (16,)},
+}
+
+
+SMALL = {
+    "horizon": 8,
+    "n_action_steps": 4,
+    "num_train_timesteps": 10,
+    "mlp": MLPDenoiserConfig(width=16, n_blocks=1, time_embed_dim=8),
+    "transformer": TransformerDenoiserConfig(width=16, n_layers=1, n_heads=2, attention_dropout=0.0),
+    "device": "cpu",
+    "push_to_hub": False,
+}
 
 
 @pytest.fixture
 def make_policy(input_features, output_features):
     def build(**options) -> DiffusionTransformerPolicy:
-        config = DiffusionTransformerConfig(
-            **{
-                "horizon": 8,
-                "n_action_steps": 4,
-                "num_train_timesteps": 10,
-                "mlp": MLPDenoiserConfig(width=16, n_blocks=1, time_embed_dim=8),
-                "input_features": dict(input_features),
-                "output_features": dict(output_features),
-                "device": "cpu",
-                "push_to_hub": False,
-                **options,
-            }
-        )
-        return DiffusionTransformerPolicy(config)
+        features = {"input_features": dict(input_features), "output_features": dict(output_features)}
+        return DiffusionTransformerPolicy(DiffusionTransformerConfig(**{**SMALL, **features, **options}))
 
     return build
 
@@ -85,8 +96,9 @@ def averaged(after, power, max_decay):
     return mean
 
 
-def test_eval_swaps_the_average_in_and_train_swaps_it_out(make_policy, batch):
-    policy = make_policy(ema=EMAConfig(power=0.5, max_decay=0.6))
+@pytest.mark.parametrize("denoiser", DENOISERS)
+def test_eval_swaps_the_average_in_and_train_swaps_it_out(make_policy, batch, denoiser):
+    policy = make_policy(ema=EMAConfig(power=0.5, max_decay=0.6), **DENOISERS[denoiser])
     after = fit(policy, batch, 6)
     policy.eval()
     expected = averaged(after, 0.5, 0.6)
@@ -146,9 +158,10 @@ def test_without_training_or_average_no_raw_weights_are_written(make_policy, bat
     assert same(weights(DiffusionTransformerPolicy.from_pretrained(tmp_path / "raw")), raw)
 
 
-def test_resuming_continues_raw_weights_and_average(make_policy, batch, tmp_path):
+@pytest.mark.parametrize("denoiser", DENOISERS)
+def test_resuming_continues_raw_weights_and_average(make_policy, batch, tmp_path, denoiser):
     torch.manual_seed(0)
-    policy = make_policy()
+    policy = make_policy(**DENOISERS[denoiser])
     fit(policy, batch, 3)
     policy.save_pretrained(tmp_path)
     torch.manual_seed(1)
@@ -177,6 +190,29 @@ def test_resuming_without_raw_weights_is_refused(make_policy, batch, tmp_path):
         fit(resumed, batch, 1)
 
 
+def test_a_state_dict_given_for_saving_is_replaced_by_the_average(make_policy, batch, tmp_path):
+    policy = make_policy()
+    raw = fit(policy, batch, 3)[-1]
+    policy.save_pretrained(tmp_path, state_dict=policy.state_dict())
+    assert same(weights(policy), raw)
+    policy.eval()
+    assert same(weights(DiffusionTransformerPolicy.from_pretrained(tmp_path)), weights(policy))
+
+
+def test_averaging_sharded_parameters_is_refused(make_policy, batch, monkeypatch):
+    monkeypatch.setenv("ACCELERATE_USE_FSDP", "true")
+    with pytest.raises(RuntimeError, match=r"FSDP.*--policy.ema.enable=false"):
+        fit(make_policy(), batch, 1)
+    fit(make_policy(ema=EMAConfig(enable=False)), batch, 1)
+
+
+def test_batch_normalisation_beside_the_average_is_pointed_out(make_policy, batch, caplog):
+    policy = make_policy()
+    policy.diffusion.encoder = torch.nn.BatchNorm1d(2)
+    fit(policy, batch, 1)
+    assert "--policy.use_group_norm=true" in caplog.text
+
+
 def test_starting_from_a_checkpoint_starts_from_its_average(make_policy, batch, tmp_path):
     policy = make_policy()
     fit(policy, batch, 3)
@@ -191,11 +227,51 @@ def test_starting_from_a_checkpoint_starts_from_its_average(make_policy, batch, 
     assert same(weights(started), weights(policy))
 
 
-def test_it_is_lerobots_diffusion_policy_with_another_network(make_policy, batch):
-    policy = make_policy().eval()
-    assert isinstance(policy, DiffusionPolicy) and isinstance(policy.diffusion.unet, MLPDenoiser)
+@pytest.mark.parametrize(
+    ("denoiser", "network"),
+    [("mlp", MLPDenoiser), ("transformer", TransformerDenoiser), ("unet", DiffusionConditionalUnet1d)],
+)
+def test_it_is_lerobots_diffusion_policy_with_the_network_named(make_policy, batch, denoiser, network):
+    policy = make_policy(**DENOISERS[denoiser]).eval()
+    assert isinstance(policy, DiffusionPolicy) and isinstance(policy.diffusion.unet, network)
     observation = {key: value[:, -1] for key, value in batch.items() if key.startswith("observation")}
     assert policy.select_action(observation).shape == (B, 2)
+
+
+def test_the_unet_is_lerobots(make_policy, batch):
+    """The same weights give the same loss and the same actions as `--policy.type=diffusion`."""
+    ours = make_policy(noise_samples_per_frame=1, **DENOISERS["unet"])
+    theirs = DiffusionPolicy(ours.config)
+    theirs.load_state_dict(ours.state_dict())
+    losses, chunks = [], []
+    for policy in (ours, theirs):
+        torch.manual_seed(1)
+        losses.append(policy.train().forward(batch)[0])
+        chunks.append(policy.eval().diffusion.generate_actions(batch))
+    assert torch.equal(*losses) and torch.equal(*chunks)
+
+
+def test_down_dims_size_the_unet_and_default_to_lerobots():
+    assert DiffusionTransformerConfig(denoiser="unet", device="cpu").down_dims == (512, 1024, 2048)
+    assert DiffusionTransformerConfig(denoiser="unet", device="cpu", down_dims=(32, 64)).down_dims == (32, 64)
+    assert DiffusionTransformerConfig(denoiser="transformer", device="cpu").down_dims == (16,)
+
+
+@pytest.mark.parametrize("denoiser", DENOISERS)
+def test_optimizer_groups_survive_a_resume(make_policy, batch, tmp_path, denoiser):
+    policy = make_policy(optimizer_weight_decay=0.1, **DENOISERS[denoiser]).train()
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    policy.forward(batch)[0].backward()
+    optimizer.step()
+    save_optimizer_state(optimizer, tmp_path)
+    resumed = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    load_optimizer_state(resumed, tmp_path)
+    decays = [group["weight_decay"] for group in resumed.param_groups]
+    assert decays == ([0.1, 0.0] if denoiser == "transformer" else [0.1])
+    for old, new in zip(optimizer.param_groups, resumed.param_groups, strict=True):
+        assert {k: old[k] for k in ("lr", "betas", "eps")} == {k: new[k] for k in ("lr", "betas", "eps")}
+        for parameter in old["params"]:
+            assert torch.equal(optimizer.state[parameter]["exp_avg"], resumed.state[parameter]["exp_avg"])
 
 
 def test_repeated_noise_levels_average_the_same_loss(make_policy, batch):
@@ -211,14 +287,43 @@ def test_repeated_noise_levels_average_the_same_loss(make_policy, batch):
     assert torch.equal(loss, expected)
 
 
-def test_denoiser_sees_chunk_step_and_condition():
-    net = MLPDenoiser(horizon=4, action_dim=2, cond_dim=3, width=16, n_blocks=2, time_embed_dim=8)
-    x, t, cond = torch.randn(B, 4, 2), torch.arange(B), torch.randn(B, 3)
-    out = net(x, t, cond)
-    assert out.shape == x.shape
-    assert torch.equal(net(x, 3, cond)[3], net(x, torch.full((B,), 3), cond)[3])
-    for changed in ((x + 1, t, cond), (x, t + 1, cond), (x, t, cond + 1)):
-        assert not torch.allclose(net(*changed), out)
+def test_one_observation_has_many_noise_levels_but_is_encoded_once(make_policy, batch):
+    policy = make_policy(noise_samples_per_frame=3).train()
+    seen = []
+    policy.diffusion.unet.register_forward_pre_hook(
+        lambda module, args, kwargs: seen.append((args[0], args[1], kwargs["global_cond"])), with_kwargs=True
+    )
+    policy.forward(batch)
+    noisy, levels, condition = seen[0]
+    assert len(noisy) == len(levels) == len(condition) == 3 * B
+    rows = torch.cat([batch["observation.state"], batch["observation.environment_state"]], -1).flatten(1)
+    assert torch.equal(condition, rows.repeat_interleave(3, 0))
+    assert len(levels.unique()) > 1
+    policy.eval().forward(batch)
+    assert len(seen[1][0]) == B
+
+
+@pytest.mark.parametrize("n_obs_steps", [1, 2])
+@pytest.mark.parametrize("denoiser", DENOISERS)
+def test_frames_from_memory_give_the_loss_of_the_loaders_chunks(demonstrations, denoiser, n_obs_steps):
+    """The dataset's own delta frames, normalised by the processors, against rows cut from memory."""
+    options = {**SMALL, **DENOISERS[denoiser], "n_obs_steps": n_obs_steps}
+    config = DiffusionTransformerConfig(**options)
+    policy = make_lerobot_policy(config, ds_meta=demonstrations.meta).train()
+    pre, _ = make_pre_post_processors(config, dataset_stats=demonstrations.meta.stats)
+    picked = [1, 5, 9]
+    frames = pre(default_collate([demonstrations[i] for i in picked]))
+    config.in_memory = False
+    chunks = LeRobotDataset(
+        "local/small",
+        root=demonstrations.root,
+        delta_timestamps=resolve_delta_timestamps(config, demonstrations.meta),
+    )
+    losses = []
+    for delivered in (frames, pre(default_collate([chunks[i] for i in picked]))):
+        torch.manual_seed(3)
+        losses.append(policy.forward(delivered)[0])
+    torch.testing.assert_close(*losses)
 
 
 @pytest.mark.parametrize(
@@ -232,6 +337,12 @@ def test_denoiser_sees_chunk_step_and_condition():
 def test_wrong_flags_are_named(make_policy, options, flag):
     with pytest.raises(ValueError, match=flag):
         make_policy(**options)
+
+
+def test_a_policy_without_a_state_is_refused(make_policy, input_features):
+    without = {k: v for k, v in input_features.items() if k != "observation.state"}
+    with pytest.raises(ValueError, match="observation.state and action"):
+        make_policy(input_features=without)
 
 
 def test_wrong_group_flags_are_named():
@@ -250,7 +361,7 @@ def test_config_round_trip(make_policy, tmp_path):
     assert json.loads((tmp_path / "config.json").read_text())["type"] == "diffusion_transformer"
     loaded = PreTrainedConfig.from_pretrained(tmp_path)
     assert isinstance(loaded, DiffusionTransformerConfig)
-    assert (loaded.mlp, loaded.ema, loaded.horizon) == (config.mlp, config.ema, 8)
+    assert loaded == config
 
 
 @pytest.mark.parametrize("in_memory", [True, False])

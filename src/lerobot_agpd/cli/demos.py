@@ -1,4 +1,9 @@
-"""`lerobot-agpd-demos`: successful episodes of a scripted expert as a LeRobotDataset."""
+"""`lerobot-agpd-demos`: successful episodes of a scripted expert as a LeRobotDataset.
+
+With `--skill` below 1 the expert is played by an operator who hesitates, trembles, takes detours and makes mistakes
+(`envs.operators`); a list of skills makes a mixture of operators. The dataset then has the feature `skill`, which no
+policy reads, and `meta/demos.json` the skill of every episode.
+"""
 
 import json
 import logging
@@ -12,26 +17,26 @@ import draccus
 import gymnasium as gym
 import numpy as np
 from datasets import disable_progress_bars
+from lerobot.configs import FeatureType
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
-from lerobot.utils.constants import ACTION, DONE, OBS_ENV_STATE, OBS_STATE, REWARD
+from lerobot.utils.constants import DONE, REWARD, SUCCESS
 from lerobot.utils.utils import init_logging
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
 
 from lerobot_agpd.collect.config import EVALUATION_SEEDS
+from lerobot_agpd.envs.demonstrations import DemosReport, Frame, play_episode
 from lerobot_agpd.envs.experts import Expert, make_expert
-from lerobot_agpd.envs.gymnasium_robotics import AGENT_POS, ENVIRONMENT_STATE, GymnasiumRoboticsEnv
+from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
+from lerobot_agpd.envs.operators import Operator
 
 logger = logging.getLogger(__name__)
 
 # Attempts per wanted episode after which the expert is held to be broken.
 MAX_ATTEMPTS_PER_EPISODE = 10
-SUCCESS = "next.success"
+SKILL = "skill"
 REPORT_PATH = Path("meta/demos.json")
-
-Frame = dict[str, Any]
 
 
 @dataclass
@@ -39,12 +44,11 @@ class DemosConfig:
     """Options of `lerobot-agpd-demos`."""
 
     root: Path  # folder of the new dataset; must not exist
-    env: EnvConfig = field(
-        default_factory=GymnasiumRoboticsEnv
-    )  # environment; its task needs a scripted expert
+    env: EnvConfig = field(default_factory=GymnasiumRoboticsEnv)  # its task needs a scripted expert
     repo_id: str = "local/demos"  # name of the new dataset
     episodes: int = 50  # successful episodes to record
     seed: int = 0  # attempt i starts from environment seed `seed + i`
+    skill: float | list[float] = 1.0  # 1 is the expert, 0 the worst operator; "[1,0.5]": in turn
     push_to_hub: bool = False  # upload the dataset when it is done
 
     def __post_init__(self) -> None:
@@ -57,6 +61,8 @@ class DemosConfig:
         """
         if not isinstance(self.env, GymnasiumRoboticsEnv):
             raise ValueError(f"--env.type={self.env.type} has no scripted experts; use gymnasium_robotics.")
+        if not self.skills or not all(0 <= skill <= 1 for skill in self.skills):
+            raise ValueError(f"--skill={self.skill} must be one or several numbers in [0, 1].")
         if self.episodes < 1:
             raise ValueError(f"--episodes must be at least 1, got {self.episodes}.")
         if self.seed < 0 or self.seed + self.episodes > EVALUATION_SEEDS[0]:
@@ -67,90 +73,33 @@ class DemosConfig:
         if self.root.exists():
             raise FileExistsError(f"--root={self.root} already exists; choose a new folder.")
 
-
-@dataclass
-class DemosReport:
-    """What happened to the attempts; written to `meta/demos.json` in the dataset.
-
-    Attributes:
-        task: the environment's task.
-        seeds: environment seed of every recorded episode, in order.
-        trivial_seeds: seeds skipped because the goal was reached before the first step.
-        failed_seeds: seeds whose goal was not reached at the last step.
-        frames: recorded frames.
-    """
-
-    task: str
-    seeds: list[int] = field(default_factory=list)
-    trivial_seeds: list[int] = field(default_factory=list)
-    failed_seeds: list[int] = field(default_factory=list)
-    frames: int = 0
+    @property
+    def skills(self) -> list[float]:
+        """One skill per operator."""
+        return self.skill if isinstance(self.skill, list) else [self.skill]
 
     @property
-    def attempts(self) -> int:
-        """Episodes begun, those with a trivial start included."""
-        return len(self.seeds) + len(self.trivial_seeds) + len(self.failed_seeds)
-
-    @property
-    def success_rate(self) -> float:
-        """Share of episodes with the goal reached at the last step, without trivial starts; nan if there are none."""
-        played = len(self.seeds) + len(self.failed_seeds)
-        return len(self.seeds) / played if played else float("nan")
-
-    def to_table(self) -> Table:
-        """Lay the counts out for the console."""
-        table = Table("scripted expert", self.task)
-        table.add_row("attempts", str(self.attempts))
-        table.add_row("skipped: goal reached at the start", str(len(self.trivial_seeds)))
-        table.add_row("dropped: failed", str(len(self.failed_seeds)))
-        table.add_row("recorded episodes", str(len(self.seeds)))
-        table.add_row("recorded frames", str(self.frames))
-        table.add_row("success rate without trivial starts", f"{self.success_rate:.3f}")
-        return table
+    def is_expert(self) -> bool:
+        """Whether the expert itself plays alone."""
+        return self.skills == [1.0]
 
 
-def dataset_features(env_config: EnvConfig) -> dict[str, dict[str, Any]]:
-    """Features of a recorded frame: the environment's, reward, success and end of the episode."""
-    features: dict[str, dict[str, Any]] = {
-        env_config.features_map[key]: {"dtype": "float32", "shape": tuple(feature.shape), "names": None}
-        for key, feature in env_config.features.items()
-    }
+def dataset_features(config: DemosConfig) -> dict[str, dict[str, Any]]:
+    """Features of a recorded frame: the environment's, reward, success, end of the episode and perhaps the skill."""
+    features: dict[str, dict[str, Any]] = {}
+    for key, feature in config.env.features.items():
+        is_image = feature.type is FeatureType.VISUAL
+        features[config.env.features_map[key]] = {
+            "dtype": "image" if is_image else "float32",
+            "shape": tuple(feature.shape),
+            "names": ["height", "width", "channel"] if is_image else None,
+        }
     features[REWARD] = {"dtype": "float32", "shape": (1,), "names": None}
     features[SUCCESS] = {"dtype": "bool", "shape": (1,), "names": None}
     features[DONE] = {"dtype": "bool", "shape": (1,), "names": None}
+    if not config.is_expert:
+        features[SKILL] = {"dtype": "float32", "shape": (1,), "names": None}
     return features
-
-
-def play_episode(env: gym.Env, expert: Expert, seed: int) -> list[Frame] | None:
-    """Let the expert play one episode to its end.
-
-    Args:
-        env: a single environment with LeRobot's raw keys.
-        expert: maps a raw observation to an action.
-        seed: environment seed of the reset.
-
-    Returns:
-        One dataset frame per step, or None if the goal is reached before the first step.
-    """
-    observation, info = env.reset(seed=seed)
-    if info["is_success"]:
-        return None
-    frames: list[Frame] = []
-    done = False
-    while not done:
-        action = expert(observation)
-        frame = {
-            OBS_STATE: observation[AGENT_POS],
-            OBS_ENV_STATE: observation[ENVIRONMENT_STATE],
-            ACTION: action,
-        }
-        observation, reward, terminated, truncated, info = env.step(action)
-        done = terminated or truncated
-        frame[REWARD] = np.array([reward], dtype=np.float32)
-        frame[SUCCESS] = np.array([info["is_success"]], dtype=bool)
-        frame[DONE] = np.array([done], dtype=bool)
-        frames.append(frame)
-    return frames
 
 
 def successful_episodes(
@@ -158,7 +107,8 @@ def successful_episodes(
 ) -> Iterator[list[Frame]]:
     """Play seed after seed and yield episodes whose goal is reached at the last step, `config.episodes` of them.
 
-    `report` is brought up to date on the way.
+    Operators take turns: the one whose turn it is plays until an episode succeeds. Their noise follows from
+    `config.seed` and the seed of the episode. `report` is brought up to date on the way.
 
     Raises:
         RuntimeError: if the seeds reach those of evaluations, or after `MAX_ATTEMPTS_PER_EPISODE` attempts per wanted
@@ -169,16 +119,23 @@ def successful_episodes(
         if seed >= EVALUATION_SEEDS[0] or report.attempts >= MAX_ATTEMPTS_PER_EPISODE * config.episodes:
             raise RuntimeError(
                 f"Only {len(report.seeds)} of {config.episodes} episodes succeeded in {report.attempts} attempts "
-                f"({len(report.trivial_seeds)} trivial, {len(report.failed_seeds)} failed); next seed {seed}."
+                f"({len(report.trivial_seeds)} trivial, {len(report.failed_seeds)} failed); next seed {seed}. "
+                "A less skilled operator needs a larger --env.episode_length."
             )
-        frames = play_episode(env, expert, seed)
+        skill = config.skills[len(report.seeds) % len(config.skills)]
+        operator = Operator(expert, skill, np.random.default_rng([config.seed, seed]))
+        frames = play_episode(env, operator, seed, config.env.features_map)
         if frames is None:
             report.trivial_seeds.append(seed)
         elif not frames[-1][SUCCESS].item():
             report.failed_seeds.append(seed)
+            report.failed_skills.append(skill)
         else:
             report.seeds.append(seed)
+            report.skills.append(skill)
             report.frames += len(frames)
+            if not config.is_expert:
+                frames = [{**frame, SKILL: np.array([skill], dtype=np.float32)} for frame in frames]
             yield frames
 
 
@@ -208,7 +165,7 @@ def record_demos(config: DemosConfig) -> DemosReport:
         dataset = LeRobotDataset.create(
             config.repo_id,
             fps=config.env.fps,
-            features=dataset_features(config.env),
+            features=dataset_features(config),
             root=partial,
             use_videos=False,
         )

@@ -1,21 +1,26 @@
-"""`lerobot-agpd-export`: an AGPD student as a plain `act` checkpoint that loads without this plugin."""
+"""`lerobot-agpd-export`: a student as a plain `act` or `diffusion` checkpoint that loads without this plugin."""
 
 import logging
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import draccus
-import torch
 from lerobot.configs import PreTrainedConfig
-from lerobot.policies import make_pre_post_processors
+from lerobot.policies import PreTrainedPolicy, get_policy_class, make_pre_post_processors
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
+from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.random_utils import seeded_context
 from lerobot.utils.utils import init_logging
-from torch import Tensor
 
+from lerobot_agpd.analysis.latency import random_observations
 from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig
-from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
+from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
+    DiffusionTransformerConfig,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -27,8 +32,8 @@ TOLERANCE = 1e-6
 class ExportConfig:
     """Options of `lerobot-agpd-export`."""
 
-    checkpoint: str  # pretrained_model folder (or Hub repository) of an agpd policy
-    output: Path  # folder of the act checkpoint; must not exist
+    checkpoint: str  # pretrained_model folder (or Hub repository) of a student or teacher of this plugin
+    output: Path  # folder of the plain checkpoint; must not exist
     repo_id: str | None = None  # Hub repository to upload to
     push_to_hub: bool = False  # upload the result
 
@@ -39,62 +44,85 @@ class ExportConfig:
             raise ValueError("--push_to_hub=true needs --repo_id")
 
 
-def as_act(policy: AGPDPolicy) -> ACTPolicy:
-    """The same network as LeRobot's ACT; discriminator and representation stay behind."""
-    config = ACTConfig(**{field.name: getattr(policy.config, field.name) for field in fields(ACTConfig)})
-    config.pretrained_path = None
-    config.pretrained_backbone_weights = None  # the weights follow; do not download others first
-    act = ACTPolicy(config)
-    prefix = "model."
-    weights = {key: value for key, value in policy.state_dict().items() if key.startswith(prefix)}
-    act.load_state_dict(weights, strict=True)
-    return act.to(config.device).eval()
+def as_plain(policy: PreTrainedPolicy) -> PreTrainedPolicy:
+    """The same acting network as a policy of LeRobot's own; what only trained it stays behind.
 
-
-def largest_difference(policy: AGPDPolicy, act: ACTPolicy, batch_size: int = 8) -> float:
-    """Largest difference of the two policies' chunks at random normalised observations."""
-    generator = torch.Generator().manual_seed(0)
-    batch: dict[str, Tensor] = {
-        key: torch.randn(batch_size, *feature.shape, generator=generator).to(policy.config.device)
-        for key, feature in (policy.config.input_features or {}).items()
-    }
-    return float(
-        (policy.predict_action_chunk(dict(batch)) - act.predict_action_chunk(dict(batch))).abs().max()
+    Raises:
+        ValueError: if LeRobot has no such network.
+    """
+    config: Any = policy.config
+    if isinstance(config, AGPDConfig):
+        return _as(ACTPolicy, ACTConfig, "model.", policy)
+    if isinstance(config, DiffusionTransformerConfig) and config.denoiser == "unet":
+        return _as(DiffusionPolicy, DiffusionConfig, "diffusion.", policy)
+    found = f"'{config.type}'" + (
+        f" with denoiser '{config.denoiser}'" if hasattr(config, "denoiser") else ""
+    )
+    raise ValueError(
+        f"--checkpoint is a {found} policy, for which LeRobot has no network of its own; 'agpd' exports to 'act', "
+        "and diffusion policies of this plugin with --policy.denoiser=unet export to 'diffusion'"
     )
 
 
-def export(config: ExportConfig) -> ACTPolicy:
-    """Write the act checkpoint with its processors.
+def _as(
+    policy_class: type[PreTrainedPolicy],
+    config_class: type[PreTrainedConfig],
+    prefix: str,
+    policy: PreTrainedPolicy,
+) -> PreTrainedPolicy:
+    config: Any = config_class(
+        **{field.name: getattr(policy.config, field.name) for field in fields(config_class) if field.init}
+    )
+    config.pretrained_path = None
+    config.pretrained_backbone_weights = None  # the weights follow; do not download others first
+    plain = policy_class(config)
+    weights = {key: value for key, value in policy.state_dict().items() if key.startswith(prefix)}
+    plain.load_state_dict(weights, strict=True)
+    return plain.to(config.device).eval()
+
+
+def largest_difference(policy: PreTrainedPolicy, plain: PreTrainedPolicy, batch_size: int = 8) -> float:
+    """Largest difference of the two policies' chunks at random normalised observations, from the same noise."""
+    observations = random_observations(policy, batch_size)
+    chunks = []
+    for each in (policy, plain):
+        each.reset()
+        with seeded_context(0):
+            chunks.append(each.predict_action_chunk(dict(observations)))
+    return float((chunks[0] - chunks[1]).abs().max())
+
+
+def export(config: ExportConfig) -> PreTrainedPolicy:
+    """Write the plain checkpoint with its processors.
 
     Raises:
-        ValueError: if the checkpoint is not an agpd policy.
+        ValueError: if LeRobot has no policy with the checkpoint's network.
         RuntimeError: if the exported policy acts differently.
     """
-    policy_config = PreTrainedConfig.from_pretrained(config.checkpoint)
-    if not isinstance(policy_config, AGPDConfig):
-        raise ValueError(
-            f"--checkpoint={config.checkpoint} is a '{policy_config.type}' policy; only 'agpd' exports to 'act'"
-        )
-    policy_config.pretrained_backbone_weights = None
-    policy = AGPDPolicy.from_pretrained(config.checkpoint, config=policy_config)
-    act = as_act(policy)
-    difference = largest_difference(policy, act)
+    policy_config: Any = PreTrainedConfig.from_pretrained(config.checkpoint)
+    if hasattr(policy_config, "pretrained_backbone_weights"):
+        policy_config.pretrained_backbone_weights = None
+    policy = get_policy_class(policy_config.type).from_pretrained(config.checkpoint, config=policy_config)
+    plain = as_plain(policy)
+    difference = largest_difference(policy, plain)
     if difference > TOLERANCE:
         raise RuntimeError(f"the exported policy's actions differ by {difference:.2e}")
-    act.save_pretrained(config.output)
+    plain.save_pretrained(config.output)
     for processor in make_pre_post_processors(policy_config, pretrained_path=config.checkpoint):
         processor.save_pretrained(config.output)
-    logger.info("act checkpoint in %s; largest difference of actions %.1e", config.output, difference)
-    return act
+    logger.info(
+        "%s checkpoint in %s; largest difference of actions %.1e", plain.name, config.output, difference
+    )
+    return plain
 
 
 @draccus.wrap()
 def run(config: ExportConfig) -> None:
     """Export and optionally upload."""
-    act = export(config)
+    plain = export(config)
     if config.push_to_hub:
-        act.push_to_hub(str(config.repo_id))
-        for processor in make_pre_post_processors(act.config, pretrained_path=str(config.output)):
+        plain.push_to_hub(str(config.repo_id))
+        for processor in make_pre_post_processors(plain.config, pretrained_path=str(config.output)):
             processor.push_to_hub(str(config.repo_id))
 
 

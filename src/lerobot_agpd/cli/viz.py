@@ -4,7 +4,7 @@ import logging
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,6 @@ import rerun as rr
 import torch
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors
-from lerobot.envs.utils import env_to_policy_features
-from lerobot.policies import get_policy_class, make_pre_post_processors
-from lerobot.processor import NormalizerProcessorStep
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 from rich.console import Console
@@ -31,17 +28,13 @@ from lerobot_agpd.analysis.recording import (
     log_rollout,
 )
 from lerobot_agpd.collect.config import EVALUATION_SEEDS
+from lerobot_agpd.collect.deciders.teacher import GuidedTeacher
 from lerobot_agpd.collect.recorders import DecisionRecorder, FrameRecorder
 from lerobot_agpd.collect.rollout import Rollouts
-from lerobot_agpd.collect.strategies import GuidedTeacher
-from lerobot_agpd.distill.environment import check_environment_fits
-from lerobot_agpd.distill.guided import Proposer
+from lerobot_agpd.distill.loading import load_pair, require_student, student_config_from_command_line
 from lerobot_agpd.distill.state import DistillationState, replay_root
-from lerobot_agpd.distill.student import DistilledStudent
 from lerobot_agpd.guidance.config import TeacherConfig
-from lerobot_agpd.guidance.teacher import check_teacher_fits, load_teacher
 from lerobot_agpd.replay.episode import Episode, Ticket
-from lerobot_agpd.replay.normalisation import Normaliser
 from lerobot_agpd.replay.store import ReplayStore
 from lerobot_agpd.run import RunInfo
 
@@ -71,21 +64,7 @@ class VizConfig:
         Raises:
             ValueError: if there is no checkpoint, or a number is out of range.
         """
-        path = parser.get_path_arg("policy")
-        if path:
-            overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
-            self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
-            self.policy.pretrained_path = Path(path)
-        if self.policy is None or not self.policy.pretrained_path:
-            raise ValueError(
-                "--policy.path is not set: name the checkpoint folder of a policy trained with AGPD "
-                "(<output_dir>/checkpoints/last/pretrained_model)"
-            )
-        if not isinstance(getattr(self.policy, "teacher", None), TeacherConfig):
-            raise ValueError(
-                f"--policy.path={self.policy.pretrained_path} is a '{self.policy.type}' policy, which has no "
-                "teacher; name a policy trained with AGPD (type 'agpd' or another distilled one)"
-            )
+        self.policy = require_student(student_config_from_command_line() or self.policy)
         if self.episodes < 1:
             raise ValueError(f"--episodes must be at least 1, got {self.episodes}")
         if self.scale is not None and self.scale < 0:
@@ -100,27 +79,6 @@ class VizConfig:
 # ---- student and teacher ----
 
 
-def load_student(config: PreTrainedConfig) -> Proposer:
-    """Load the checkpoint at `config.pretrained_path`.
-
-    Raises:
-        ValueError: if the policy is not a student of AGPD or its checkpoint has no normaliser.
-    """
-    path = str(config.pretrained_path)
-    policy = get_policy_class(config.type).from_pretrained(path, config=config)
-    if not isinstance(policy, DistilledStudent):
-        raise ValueError(f"--policy.path={path} is a '{config.type}' policy, not a student of AGPD")
-    preprocessor, _ = make_pre_post_processors(
-        config,
-        pretrained_path=path,
-        preprocessor_overrides={"device_processor": {"device": config.device}},
-    )
-    for step in preprocessor.steps:
-        if isinstance(step, NormalizerProcessorStep) and step.stats is not None:
-            return Proposer(policy.eval(), Normaliser(config, step.stats))
-    raise ValueError(f"the preprocessor in --policy.path={path} holds no statistics to normalise with")
-
-
 def make_guided_teacher(config: VizConfig) -> GuidedTeacher:
     """The checkpoint's teacher, guided toward its student as during collection.
 
@@ -128,12 +86,9 @@ def make_guided_teacher(config: VizConfig) -> GuidedTeacher:
         ValueError: if teacher, student and environment do not fit together.
     """
     policy_config: Any = config.policy
-    chosen = {key: value for key, value in asdict(config.teacher).items() if value}
-    teacher = load_teacher(replace(policy_config.teacher, **chosen), policy_config.device)
-    check_environment_fits(config.env, policy_config, teacher)
-    check_teacher_fits(teacher, env_to_policy_features(config.env), policy_config.action_feature)
+    proposer, teacher = load_pair(policy_config, config.teacher, config.env)
     noise = torch.Generator(device=policy_config.device).manual_seed(config.seed)
-    return load_student(policy_config).guided(teacher, noise)
+    return proposer.guided(teacher, noise)
 
 
 def guidance_scale(config: VizConfig) -> float:

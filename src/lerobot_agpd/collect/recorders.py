@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,8 +10,10 @@ from gymnasium.vector import VectorEnv, VectorWrapper
 from torch import Tensor
 
 from lerobot_agpd.analysis.recording import Array, Chunks, DecisionRecord
-from lerobot_agpd.collect.rollout import Decision
-from lerobot_agpd.collect.strategies import GuidedTeacher
+from lerobot_agpd.collect.decider import Decision
+from lerobot_agpd.collect.deciders.teacher import GuidedTeacher
+from lerobot_agpd.collect.stopwatch import Stopwatch
+from lerobot_agpd.guidance.teacher import History
 
 
 class DecisionRecorder:
@@ -29,18 +30,22 @@ class DecisionRecorder:
 
     @property
     def n_obs_steps(self) -> int:
-        """The teacher's history."""
+        """The guided teacher's."""
         return self.guided.n_obs_steps
 
-    def decide(self, history: Mapping[str, Tensor], scale: Tensor) -> Decision:
+    @property
+    def stopwatch(self) -> Stopwatch:
+        """The guided teacher's."""
+        return self.guided.stopwatch
+
+    def decide(self, history: History, strength: Tensor, rolling_in: Tensor | None = None) -> Decision:
         """The guided decision; the unguided one is drawn first, from the same noise."""
         noise = self.guided.generator.get_state()
-        alone = self.guided.decide(history, torch.zeros_like(scale))
+        alone = self.guided.decide(history, torch.zeros_like(strength))
         self.guided.generator.set_state(noise)
-        decision = self.guided.decide(history, scale)
-        n_steps = self.guided.alignment.n_steps
-        chunk_hat = self.guided.propose({key: value[:, -1] for key, value in history.items()})
-        student = self.guided.alignment.student_raw(chunk_hat[:, :n_steps])
+        decision = self.guided.decide(history, strength)
+        n_steps = self.guided.pair.alignment.n_steps
+        student = self.guided.pair.student_actions(history)
         self.decisions.append(
             DecisionRecord(
                 step=len(self.decisions) * n_steps,

@@ -28,17 +28,20 @@ def success_rate(counts: Sequence[dict[str, int]]) -> float | None:
 
 
 def summarise(records: Sequence[EpisodeRecord]) -> dict[str, Any]:
-    """The numbers of a round, guided and unguided episodes apart."""
-    guided = [record for record in records if record.scale > 0]
-    unguided = [record for record in records if record.scale == 0]
+    """The numbers of a round: episodes with guidance (or mixing), the teacher's own, and the student's own."""
+    with_teacher = [record for record in records if not record.student_alone]
+    guided = [record for record in with_teacher if record.scale > 0]
+    unguided = [record for record in with_teacher if record.scale == 0]
     return {
         **tally(records),
         "guided": tally(guided),
         "unguided": tally(unguided),
+        "student_alone": tally([record for record in records if record.student_alone]),
         "mean_max_reward": _mean([record.max_reward for record in records]),
         "mean_j_guided": _mean([record.j for record in guided]),
         "mean_j_unguided": _mean([record.j for record in unguided]),
         "mean_shift_in_sigmas": _mean([record.shift for record in guided]),
+        "mean_student_steps": _mean([record.student_steps for record in with_teacher]),
         "kept_frames": sum(record.length for record in records if record.kept),
         "episodes": [record.to_json() for record in records],
     }

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import time
-from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -17,87 +13,11 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
+from lerobot_agpd.collect.config import RollinConfig
+from lerobot_agpd.collect.decider import Decider
+from lerobot_agpd.collect.slot import Slot
+from lerobot_agpd.guidance.teacher import TASK
 from lerobot_agpd.replay.episode import Array, Episode, Ticket
-
-
-@dataclass(frozen=True)
-class Decision:
-    """Chunks to execute.
-
-    Attributes:
-        actions: (B, n, A) in the environment's units.
-        j: (B,) discrepancy between what is executed and the student's chunk; NaN without a student.
-        shift: (B,) mean shift of the guided denoising steps in sigmas; NaN where unguided.
-    """
-
-    actions: Tensor
-    j: Tensor
-    shift: Tensor
-
-
-class Decider(Protocol):
-    """A collection strategy: observation histories in, chunks out."""
-
-    @property
-    def n_obs_steps(self) -> int:
-        """Length of the observation history it needs."""
-        ...
-
-    def decide(self, history: Mapping[str, Tensor], scale: Tensor) -> Decision:
-        """Chunks for histories (B, n_obs, ...) of raw observations under guidance scales (B,)."""
-        ...
-
-
-@dataclass
-class Stopwatch:
-    """Seconds spent, by name."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def measure(self, name: str) -> Iterator[None]:
-        """Add the time spent inside to `name`."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
-
-
-class _Slot:
-    """What one sub-environment's running episode has gathered so far."""
-
-    def __init__(self, ticket: Ticket, n_obs_steps: int):
-        self.ticket = ticket
-        self.history: deque[dict[str, Tensor]] = deque(maxlen=n_obs_steps)
-        self.queue: deque[Tensor] = deque()
-        self.observations: list[dict[str, Tensor]] = []
-        self.actions: list[Array] = []
-        self.rewards: list[float] = []
-        self.successes: list[bool | None] = []
-        self.j: list[float] = []
-        self.shift: list[float] = []
-
-    def see(self, observation: dict[str, Tensor]) -> None:
-        """Append an observation; the first one fills the whole history, as LeRobot's policies do."""
-        self.history.append(observation)
-        while len(self.history) < (self.history.maxlen or 1):
-            self.history.append(observation)
-
-    def finish(self, task: str) -> Episode:
-        keys = self.observations[0].keys()
-        return Episode(
-            ticket=self.ticket,
-            task=task,
-            observations={
-                key: np.stack([_as_recorded(step[key]) for step in self.observations]) for key in keys
-            },
-            actions=np.stack(self.actions).astype(np.float32),
-            rewards=np.array(self.rewards, dtype=np.float32),
-            successes=None if None in self.successes else np.array(self.successes, dtype=bool),
-            j=float(np.mean(self.j)),
-            shift=float(np.mean(self.shift)),
-        )
 
 
 class Rollouts:
@@ -106,8 +26,8 @@ class Rollouts:
     Args:
         envs: LeRobot vector environment.
         processors: LeRobot's environment pre- and postprocessor.
-        decider: the strategy.
-        stopwatch: takes the time of decisions and environments apart.
+        decider: the strategy; its stopwatch takes the environments' time too.
+        rollin: what to make of the first part of an episode, in which the student acts.
     """
 
     def __init__(
@@ -115,12 +35,12 @@ class Rollouts:
         envs: gym.vector.VectorEnv,
         processors: tuple[Any, Any],
         decider: Decider,
-        stopwatch: Stopwatch | None = None,
+        rollin: RollinConfig | None = None,
     ):
         self.envs = envs
         self.preprocess, self.postprocess = processors
         self.decider = decider
-        self.stopwatch = stopwatch or Stopwatch()
+        self.rollin = rollin or RollinConfig()
         self.task = _task_description(envs)
         self._was_reset = False
 
@@ -128,7 +48,7 @@ class Rollouts:
     def run(self, tickets: Iterable[Ticket]) -> Iterator[Episode]:
         """Yield episodes as they finish; slots without a further ticket idle until the last one is done."""
         waiting = iter(tickets)
-        slots: list[_Slot | None] = [None] * self.envs.num_envs
+        slots: list[Slot | None] = [None] * self.envs.num_envs
         fresh = list(range(len(slots)))
         while True:
             if fresh:
@@ -145,21 +65,21 @@ class Rollouts:
                 if slot is not None:
                     slot.see(_row(observations, number))
 
-    def _start(self, slots: list[_Slot | None], fresh: list[int], waiting: Iterator[Ticket]) -> None:
+    def _start(self, slots: list[Slot | None], fresh: list[int], waiting: Iterator[Ticket]) -> None:
         """Reset the fresh slots for which a ticket is left."""
         mask = np.zeros(len(slots), dtype=bool)
         seeds: Any = [None] * len(slots)
         for number in fresh:
             ticket = next(waiting, None)
             if ticket is not None:
-                slots[number] = _Slot(ticket, self.decider.n_obs_steps)
+                slots[number] = Slot(ticket, self.decider.n_obs_steps, self._student_steps(ticket))
                 mask[number], seeds[number] = True, ticket.seed
         if not mask.any():
             return
         if not self._was_reset:
             mask[:] = True  # sub-environments without a ticket need an observation too
             self._was_reset = True
-        with self.stopwatch.measure("environment"):
+        with self.decider.stopwatch.measure("environment"):
             raw, _ = self.envs.reset(seed=seeds, options={"reset_mask": mask, NEW_ROLLOUT_OPTION: True})
             observations = self._observe(raw)
         for number in fresh:
@@ -167,39 +87,46 @@ class Rollouts:
             if slot is not None:
                 slot.see(_row(observations, number))
 
+    def _student_steps(self, ticket: Ticket) -> int:
+        """Steps after which the teacher takes over."""
+        if ticket.student_share == 0:
+            return 0
+        limit = self.rollin.episode_steps or step_limit(self.envs)
+        return round(ticket.student_share * limit)
+
     def _observe(self, raw: Any) -> dict[str, Tensor]:
         """LeRobot's observation features, tensors (n_envs, ...) only."""
         processed = self.preprocess(preprocess_observation(raw))
         return {key: value.clone() for key, value in processed.items() if isinstance(value, Tensor)}
 
-    def _decide(self, slots: list[_Slot | None]) -> None:
+    def _decide(self, slots: Sequence[Slot | None]) -> None:
         """Fill the empty action queues, all of them in one batched decision."""
         undecided = [slot for slot in slots if slot is not None and not slot.queue]
         if not undecided:
             return
-        history = {
+        history: dict[str, Any] = {
             key: torch.stack([torch.stack([step[key] for step in slot.history]) for slot in undecided])
             for key in undecided[0].history[0]
         }
-        scale = torch.tensor([slot.ticket.scale for slot in undecided])
-        with self.stopwatch.measure("decisions"):
-            decision = self.decider.decide(history, scale)
+        history[TASK] = [self.task] * len(undecided)
+        strength = torch.tensor([slot.ticket.scale for slot in undecided])
+        rolling_in = torch.tensor([slot.rolling_in for slot in undecided])
+        decision = self.decider.decide(history, strength, rolling_in)
         if not torch.isfinite(decision.actions).all():
             raise FloatingPointError(
                 "a chunk to be executed is not finite: the teacher or the student has diverged (look at the loss, "
                 "or lower the learning rate); episodes kept so far are safe"
             )
         for row, slot in enumerate(undecided):
-            slot.queue.extend(decision.actions[row].cpu())
-            slot.j.append(float(decision.j[row]))
-            slot.shift.append(float(decision.shift[row]))
+            slot.plan(decision, row)
 
-    def _step(self, slots: list[_Slot | None]) -> tuple[dict[str, Tensor], list[tuple[int, Episode]]]:
+    def _step(self, slots: Sequence[Slot | None]) -> tuple[dict[str, Tensor], list[tuple[int, Episode]]]:
         """Execute one action in every environment."""
         idle = torch.from_numpy(np.zeros(self.envs.single_action_space.shape, dtype=np.float32))
-        actions = torch.stack([slot.queue.popleft() if slot is not None else idle for slot in slots])
-        executed: Array = self.postprocess({ACTION: actions})[ACTION].cpu().numpy()
-        with self.stopwatch.measure("environment"):
+        planned = [slot.queue.popleft() if slot is not None else (idle, idle) for slot in slots]
+        executed = self._for_environment([action for action, _ in planned])
+        recorded = self._for_environment([action for _, action in planned])
+        with self.decider.stopwatch.measure("environment"):
             raw, rewards, terminated, truncated, info = self.envs.step(executed)
             observations = self._observe(raw)
         done = terminated | truncated
@@ -207,24 +134,34 @@ class Rollouts:
         for number, slot in enumerate(slots):
             if slot is None:
                 continue
-            slot.observations.append(slot.history[-1])
-            slot.actions.append(executed[number])
-            slot.rewards.append(float(rewards[number]))
-            slot.successes.append(_success(info, number, bool(done[number])))
+            slot.record(recorded[number], float(rewards[number]), _success(info, number, bool(done[number])))
             if done[number]:
-                finished.append((number, slot.finish(self.task)))
+                finished.append((number, slot.finish(self.task, self.rollin.record_student)))
         return observations, finished
+
+    def _for_environment(self, actions: Sequence[Tensor]) -> Array:
+        """Actions (n_envs, A) as the environment takes them."""
+        processed: Tensor = self.postprocess({ACTION: torch.stack(list(actions))})[ACTION]
+        return processed.cpu().numpy()
+
+
+def step_limit(envs: Any) -> int:
+    """Steps after which the environment cuts an episode off, where LeRobot's own evaluation looks for them.
+
+    Raises:
+        ValueError: if it does not say.
+    """
+    try:
+        return int(envs.get_attr("_max_episode_steps")[0])
+    except (AttributeError, TypeError) as error:
+        raise ValueError(
+            "the environment does not say after how many steps it ends an episode (no _max_episode_steps), so a "
+            "share of an episode cannot be given to the student; say it with --policy.collect.rollin.episode_steps"
+        ) from error
 
 
 def _row(observations: dict[str, Tensor], number: int) -> dict[str, Tensor]:
     return {key: value[number] for key, value in observations.items()}
-
-
-def _as_recorded(value: Tensor) -> Array:
-    """Vectors as float32, images (C, H, W) in [0, 1] as uint8 (H, W, C)."""
-    if value.ndim == 3:
-        return (value * 255).round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()
-    return value.float().cpu().numpy()
 
 
 def _success(info: Mapping[str, Any], number: int, done: bool) -> bool | None:

@@ -8,16 +8,24 @@ from typing import Any
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors
+from lerobot.utils.random_utils import seeded_context
 from tqdm import tqdm
 
+from lerobot_agpd.collect.decider import Decider
+from lerobot_agpd.collect.diagnostics import action_diagnostics, state_diagnostics
 from lerobot_agpd.collect.report import summarise
-from lerobot_agpd.collect.rollout import Decider, Rollouts, Stopwatch
+from lerobot_agpd.collect.rollout import Rollouts
 from lerobot_agpd.collect.seeds import noise_seed, round_tickets
+from lerobot_agpd.collect.stopwatch import Stopwatch
 from lerobot_agpd.collect.success import SuccessFilter
-from lerobot_agpd.replay.episode import EpisodeRecord, Ticket
+from lerobot_agpd.collect.witness import Witness
+from lerobot_agpd.replay.episode import Episode, EpisodeRecord, Ticket
 from lerobot_agpd.replay.store import ReplayStore, Spool
 from lerobot_agpd.replay.writer import EpisodeWriter
 from lerobot_agpd.run import barrier
+
+DIAGNOSTICS = 3
+"""Stream of the random numbers of a round's diagnostics; the teacher's noise is stream 1."""
 
 
 class RoundRunner:
@@ -56,36 +64,48 @@ class RoundRunner:
         generator = torch.Generator(device=self.policy_config.device)
         return generator.manual_seed(noise_seed(self.seed, self.rank, number))
 
-    def collect(
-        self, number: int, scale: float, decider: Decider
-    ) -> tuple[list[EpisodeRecord], dict[str, float]]:
-        """Roll out what is missing of the round, write this process's dataset and wait for the others.
-
-        Returns:
-            Records of all processes' episodes, and the seconds this one spent, by activity.
-        """
-        spool = self.store.spool(number, self.rank)
-        stopwatch = Stopwatch()
-        tickets = round_tickets(
-            self.config.episodes,
+    def tickets(self, number: int, scale: float) -> list[Ticket]:
+        """The episodes of this process's share of a round; the same whenever asked."""
+        config = self.config
+        return round_tickets(
+            config.episodes,
             self.seed,
             self.rank,
             self.n_ranks,
             number,
             scale,
-            self.config.unguided_fraction,
+            config.unguided_fraction,
+            scale_spread=config.variation.scale_spread,
+            max_student_share=config.rollin.max_fraction if config.strategy == "rollin" else 0.0,
         )
+
+    def collect(
+        self, number: int, scale: float, decider: Decider
+    ) -> tuple[list[EpisodeRecord], dict[str, float]]:
+        """Roll out what is missing of the round, write this process's dataset and wait for the others.
+
+        Args:
+            number: of the round.
+            scale: guidance scale, or mixing weight.
+            decider: the strategy, made for this round; its stopwatch takes the time.
+
+        Returns:
+            Records of all processes' episodes, and the seconds this one spent in teacher, student, environment
+            and writing.
+        """
+        spool = self.store.spool(number, self.rank)
+        tickets = self.tickets(number, scale)
         missing = [ticket for ticket in tickets if ticket.number not in spool.records]
         if missing:
-            self._roll_out(number, missing, len(tickets), decider, spool, stopwatch)
-        with stopwatch.measure("writing"):
+            self._roll_out(number, missing, len(tickets), decider, spool)
+        with decider.stopwatch.measure("writing"):
             self.store.write_share(
                 number,
                 self.rank,
                 lambda root, episodes: self.writer.write(root, episodes, number, self.config.strategy),
             )
         barrier()
-        return self.store.records(number, self.n_ranks), stopwatch.seconds
+        return self.store.records(number, self.n_ranks), decider.stopwatch.seconds
 
     def _roll_out(
         self,
@@ -94,7 +114,6 @@ class RoundRunner:
         n_total: int,
         decider: Decider,
         spool: Spool,
-        stopwatch: Stopwatch,
     ) -> None:
         n_envs = min(self.config.n_envs, len(tickets))
         tasks = make_env(self.env_config, n_envs=n_envs, use_async_envs=self.config.use_async_envs)
@@ -110,9 +129,9 @@ class RoundRunner:
         )
         try:
             for position, envs in enumerate(environments):
-                rollouts = Rollouts(envs, processors, decider, stopwatch)
+                rollouts = Rollouts(envs, processors, decider, self.config.rollin)
                 for episode in rollouts.run(tickets[position :: len(environments)]):
-                    with stopwatch.measure("writing"):
+                    with decider.stopwatch.measure("writing"):
                         spool.add(episode, self.filter.judge(episode))
                     kept = sum(record.kept for record in spool.records.values())
                     progress.set_postfix_str(f"{kept} of {len(spool.records)} kept")
@@ -121,8 +140,38 @@ class RoundRunner:
             progress.close()
             close_envs(tasks)
 
+    @torch.no_grad()
+    def diagnose(self, number: int, scale: float, decider: Decider) -> dict[str, Any] | None:
+        """What the strategy did to actions and states; called on one process, before `finish`.
+
+        Actions are sampled again where this process has watched `decider` decide since it started the round;
+        states are those of all processes' kept episodes.
+
+        Returns:
+            None if `--policy.collect.diagnostics.observations` is 0.
+        """
+        if not isinstance(decider, Witness):
+            return None
+        config, stopwatch = self.config.diagnostics, Stopwatch()
+        seed = noise_seed(self.seed, self.rank, number, stream=DIAGNOSTICS)
+        history = decider.history()
+        with stopwatch.measure("diagnostics"), seeded_context(seed):
+            actions = history and action_diagnostics(decider.decider, history, scale, config.samples, seed)
+            stats = self.writer.demonstrations.stats
+            states = state_diagnostics(self._kept(number), stats, config, seed)
+        return {"actions": actions, "states": states, "seconds": stopwatch.seconds["diagnostics"]}
+
+    def _kept(self, number: int) -> list[Episode]:
+        spools = [self.store.spool(number, rank) for rank in range(self.n_ranks)]
+        return [episode for spool in spools for episode in spool.kept()]
+
     def report(
-        self, number: int, scale: float, records: Sequence[EpisodeRecord], seconds: Mapping[str, float]
+        self,
+        number: int,
+        scale: float,
+        records: Sequence[EpisodeRecord],
+        seconds: Mapping[str, float],
+        diagnostics: Mapping[str, Any] | None = None,
     ) -> dict[str, Any]:
         """The round's numbers."""
         return {
@@ -132,6 +181,7 @@ class RoundRunner:
             "environment": {"type": self.env_config.type, "task": self.env_config.task},
             "teacher": self.policy_config.teacher.path,
             "seconds": dict(seconds),
+            "diagnostics": diagnostics,
             **summarise(records),
         }
 

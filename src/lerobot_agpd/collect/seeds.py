@@ -7,6 +7,9 @@ import numpy as np
 from lerobot_agpd.collect.config import COLLECTION_SEEDS
 from lerobot_agpd.replay.episode import Ticket
 
+VARIATION = 1
+"""Stream of the random numbers that vary an episode, beside those the environment draws from the same seed."""
+
 
 def round_tickets(
     n_episodes: int,
@@ -16,21 +19,37 @@ def round_tickets(
     round_number: int,
     scale: float,
     unguided_fraction: float,
+    scale_spread: float = 1.0,
+    max_student_share: float = 0.0,
 ) -> list[Ticket]:
     """The episodes of a round of n_episodes that one process collects.
 
     Environment seeds come from SeedSequence([seed, rank, round]); unguided episodes are spread evenly over the
-    round, whatever the number of processes.
+    round, whatever the number of processes. What else differs between episodes comes from their own seeds.
+
+    Args:
+        n_episodes: of the round, over all processes.
+        seed: of the run.
+        rank: of this process.
+        n_ranks: number of processes.
+        round_number: of the round.
+        scale: guidance scale, or mixing weight.
+        unguided_fraction: share of the episodes whose scale is 0.
+        scale_spread: the others' scales are log-uniform in [scale / scale_spread, scale * scale_spread].
+        max_student_share: the student's shares of the episodes are uniform in [0, max_student_share).
     """
     first = sum(share_of(n_episodes, lower, n_ranks) for lower in range(rank))
     n_episodes = share_of(n_episodes, rank, n_ranks)
     rng = np.random.default_rng(np.random.SeedSequence([seed, rank, round_number]))
     seeds = rng.integers(*COLLECTION_SEEDS, size=n_episodes)
     unguided = np.diff(np.floor((first + np.arange(n_episodes + 1)) * unguided_fraction + 1e-9)) > 0
-    return [
-        Ticket(number, int(env_seed), 0.0 if alone else scale)
-        for number, (env_seed, alone) in enumerate(zip(seeds, unguided, strict=True))
-    ]
+    tickets = []
+    for number, (env_seed, alone) in enumerate(zip(seeds, unguided, strict=True)):
+        own = np.random.default_rng([int(env_seed), VARIATION])
+        spread, share = scale_spread ** own.uniform(-1, 1), own.uniform(0, 1)
+        drawn = 0.0 if alone else float(scale * spread)
+        tickets.append(Ticket(number, int(env_seed), drawn, float(max_student_share * share)))
+    return tickets
 
 
 def share_of(n_episodes: int, rank: int, n_ranks: int) -> int:
@@ -38,7 +57,7 @@ def share_of(n_episodes: int, rank: int, n_ranks: int) -> int:
     return n_episodes // n_ranks + (rank < n_episodes % n_ranks)
 
 
-def noise_seed(seed: int, rank: int, round_number: int) -> int:
-    """Seed of a process's sampling noise in a round."""
-    state = np.random.SeedSequence([seed, rank, round_number, 1]).generate_state(1, np.uint32)
+def noise_seed(seed: int, rank: int, round_number: int, stream: int = 1) -> int:
+    """Seed of a process's sampling noise in a round; streams are independent of each other."""
+    state = np.random.SeedSequence([seed, rank, round_number, stream]).generate_state(1, np.uint32)
     return int(state[0])

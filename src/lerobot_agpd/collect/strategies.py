@@ -1,91 +1,68 @@
-"""Collection strategies: who decides what is executed."""
+"""From `--policy.collect.strategy` to who decides what is executed.
+
+replay   the teacher alone                                  deciders/teacher.py   PD
+guided   the teacher, guided toward the student             deciders/teacher.py   AGPD, Eq. 19-20
+mixing   teacher and student share the actions              deciders/mixing.py    DAgger, Eq. 6-7
+rollin   the student begins, the (guided) teacher finishes  deciders/rollin.py    not in the paper
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
-from torch import Tensor
 
-from lerobot_agpd.collect.rollout import Decision
-from lerobot_agpd.guidance.alignment import Alignment
-from lerobot_agpd.guidance.config import GuidanceConfig
-from lerobot_agpd.guidance.discrepancy import ActionDiscrepancy, Discrepancy
-from lerobot_agpd.guidance.guide import Guide
-from lerobot_agpd.guidance.teacher import DiffusionTeacher
-
-Proposal = Callable[[Mapping[str, Tensor]], Tensor]
-"""A student: raw observations (B, ...) to its chunk (B, S, A) in its own normalised space."""
-
-DiscrepancyFactory = Callable[[Mapping[str, Tensor], Tensor, ActionDiscrepancy], Discrepancy]
-"""Builds J from raw observations (B, ...), the student's chunk (B, S, A) and the action J of the same chunk."""
+from lerobot_agpd.collect.config import CollectConfig
+from lerobot_agpd.collect.decider import Decider
+from lerobot_agpd.collect.deciders.mixing import MixedPolicies
+from lerobot_agpd.collect.deciders.pair import Pair, PairDecider
+from lerobot_agpd.collect.deciders.rollin import RollIn
+from lerobot_agpd.collect.deciders.teacher import GuidedTeacher, TeacherAlone
+from lerobot_agpd.collect.witness import Witness
 
 
-class TeacherAlone:
-    """`replay`: the unguided teacher acts (policy distillation, PD)."""
+def round_strength(config: CollectConfig, number: int, guidance_scale: float) -> float:
+    """What the episodes of a round carry as their scale.
 
-    def __init__(self, teacher: DiffusionTeacher, n_steps: int, generator: torch.Generator):
-        """Execute `n_steps` of every chunk; noise comes from `generator`."""
-        self.teacher = teacher
-        self.n_steps = n_steps
-        self.generator = generator
+    Args:
+        config: the strategy.
+        number: of the round.
+        guidance_scale: the scale that guidance has reached.
 
-    @property
-    def n_obs_steps(self) -> int:
-        """The teacher's history."""
-        return self.teacher.n_obs_steps
-
-    def decide(self, history: Mapping[str, Tensor], scale: Tensor) -> Decision:
-        """The teacher's chunks; scales are ignored."""
-        actions = self.teacher.sample(history, generator=self.generator)[:, : self.n_steps]
-        nan = torch.full((len(actions),), float("nan"))
-        return Decision(actions=actions, j=nan, shift=nan)
+    Returns:
+        The guidance scale, with `mixing` the student's weight lambda, with `replay` 0.
+    """
+    if config.strategy == "mixing":
+        return config.mixing.weight_at(number)
+    return guidance_scale if config.guides else 0.0
 
 
-class GuidedTeacher:
-    """`guided`: the teacher denoises, pulled toward the chunk that the student proposes (AGPD, Eq. 19-20)."""
+def make_decider(config: Any, pair: Pair, generator: torch.Generator) -> Decider:
+    """The strategy that `config.collect` asks for, watched if its diagnostics want to know.
 
-    def __init__(
-        self,
-        teacher: DiffusionTeacher,
-        propose: Proposal,
-        alignment: Alignment,
-        config: GuidanceConfig,
-        generator: torch.Generator,
-        make_discrepancy: DiscrepancyFactory | None = None,
-    ):
-        """Guide by the action J, or by what `make_discrepancy` builds."""
-        self.teacher = teacher
-        self.propose = propose
-        self.alignment = alignment
-        self.config = config
-        self.generator = generator
-        self.make_discrepancy = make_discrepancy
+    Args:
+        config: the student's configuration, with the groups `collect` and `guidance`.
+        pair: teacher and student.
+        generator: of the sampling noise.
 
-    @property
-    def n_obs_steps(self) -> int:
-        """The teacher's history."""
-        return self.teacher.n_obs_steps
+    Raises:
+        ValueError: if the strategy guides and the teacher cannot be guided.
+    """
+    collect = config.collect
+    if collect.strategy == "guided" or (collect.strategy == "rollin" and config.guidance.scale > 0):
+        pair.teacher.require_guidance(config.guidance.at)
+    decider = make_strategy(config, pair, generator)
+    if collect.diagnostics.observations == 0:
+        return decider
+    return Witness(decider, collect.diagnostics.observations, seed=generator.initial_seed())
 
-    def decide(self, history: Mapping[str, Tensor], scale: Tensor) -> Decision:
-        """Guided chunks; rows with scale 0 are the teacher's own."""
-        current = {key: value[:, -1] for key, value in history.items()}
-        chunk_hat = self.propose(current)  # (B, S, A), student-normalised
-        action_j = ActionDiscrepancy(self.alignment.student_in_teacher_units(chunk_hat), self.alignment.start)
-        discrepancy = (
-            self.make_discrepancy(current, chunk_hat, action_j) if self.make_discrepancy else action_j
-        )
-        guide = Guide(
-            discrepancy,
-            scale.to(chunk_hat.device),
-            at=self.config.at,
-            trust_region=self.config.trust_region,
-        )
-        actions = self.teacher.sample(history, guide, self.generator)[:, : self.alignment.n_steps]
-        gap = self.alignment.teacher_units(actions) - action_j.target
-        shift = torch.stack(guide.shift_in_sigmas).mean(dim=0) if guide.shift_in_sigmas else scale
-        return Decision(
-            actions=actions,
-            j=0.5 * gap.square().sum(dim=(1, 2)),
-            shift=torch.where(scale.to(shift) > 0, shift, torch.nan),
-        )
+
+def make_strategy(config: Any, pair: Pair, generator: torch.Generator) -> PairDecider:
+    """The strategy that `config.collect` asks for, made of a teacher and a student."""
+    collect = config.collect
+    if collect.strategy == "replay":
+        return TeacherAlone(pair, generator)
+    if collect.strategy == "mixing":
+        return MixedPolicies(pair, generator, collect.mixing)
+    guided = GuidedTeacher(pair, generator, config.guidance, collect.variation.quantile)
+    return RollIn(pair, guided) if collect.strategy == "rollin" else guided

@@ -27,7 +27,7 @@ class SuccessFilter:
         return cls(min_reward=config.min_reward, min_length=config.min_length)
 
     def judge(self, episode: Episode) -> EpisodeRecord:
-        """Pass or fail, keep or drop.
+        """Pass or fail, keep or drop; an episode that the student finished alone teaches it nothing.
 
         Raises:
             ValueError: if success is asked of an environment that does not report it.
@@ -53,7 +53,9 @@ class SuccessFilter:
             success=episode.success,
             passed=passed,
             trivial=trivial,
-            kept=passed and not trivial,
+            kept=passed and not trivial and not episode.student_alone,
             j=episode.j,
             shift=episode.shift,
+            student_steps=episode.student_steps,
+            student_alone=episode.student_alone,
         )

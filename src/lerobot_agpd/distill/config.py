@@ -1,10 +1,19 @@
-"""Flags of the adversary."""
+"""Flags of the adversary, and the groups of flags that every distilled student has."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from copy import deepcopy
+from dataclasses import dataclass, field
+from pathlib import Path
 
-from lerobot_agpd.guidance.config import require
+import draccus
+from huggingface_hub.constants import CONFIG_NAME
+from lerobot.configs import PreTrainedConfig
+
+from lerobot_agpd.collect.config import CollectConfig
+from lerobot_agpd.guidance.config import GuidanceConfig, RepresentationConfig, TeacherConfig, require
+from lerobot_agpd.replay.config import ReplayConfig
 
 FORMS = ("saturating", "non_saturating")
 
@@ -47,3 +56,27 @@ class AdversaryConfig:
             self.gradient_penalty >= 0,
             f"--policy.adversary.gradient_penalty must not be negative, got {self.gradient_penalty}",
         )
+
+
+@dataclass
+class DistilledConfig:
+    """Mixin for the configuration of a student: the groups of the distillation.
+
+    A concrete class names it before the policy's own configuration, and says which steps a chunk covers
+    (`chunk_offsets`) and how many observations it looks at (`observation_history`).
+    """
+
+    teacher: TeacherConfig = field(default_factory=TeacherConfig)
+    guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
+    collect: CollectConfig = field(default_factory=CollectConfig)
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+    adversary: AdversaryConfig = field(default_factory=AdversaryConfig)
+    representation: RepresentationConfig = field(default_factory=RepresentationConfig)
+
+    def _save_pretrained(self, save_directory: Path) -> None:
+        # The environment stays out of config.json: a checkpoint must load where its type is not registered.
+        # The run's train_config.json has it.
+        config = deepcopy(self)
+        config.collect.env = None
+        with open(save_directory / CONFIG_NAME, "w") as file:
+            json.dump(draccus.encode(config, PreTrainedConfig), file, indent=4)

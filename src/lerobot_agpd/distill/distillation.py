@@ -21,21 +21,27 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.utils.constants import ACTION
 from lerobot.utils.random_utils import seeded_context
 from torch import Tensor
 
+from lerobot_agpd.collect.decider import Decider
 from lerobot_agpd.collect.report import success_rate
 from lerobot_agpd.collect.round import RoundRunner
-from lerobot_agpd.collect.strategies import GuidedTeacher, TeacherAlone
+from lerobot_agpd.collect.seeds import noise_seed
+from lerobot_agpd.collect.strategies import round_strength
 from lerobot_agpd.distill.adversary import adversary_terms
 from lerobot_agpd.distill.environment import check_environment_fits, run_environment
-from lerobot_agpd.distill.guided import Proposer, executed_steps
+from lerobot_agpd.distill.guided import Proposer, future_steps
+from lerobot_agpd.distill.own_teacher import OwnTeacher
 from lerobot_agpd.distill.relabel import TeacherChunks
+from lerobot_agpd.distill.round_log import log_round, round_scalars
 from lerobot_agpd.distill.schedule import due_round
 from lerobot_agpd.distill.state import DistillationState, replay_root
 from lerobot_agpd.guidance.controller import next_scale
+from lerobot_agpd.guidance.loading import check_teacher_fits, load_teacher
 from lerobot_agpd.guidance.representation import reconstruction_loss
-from lerobot_agpd.guidance.teacher import DiffusionTeacher, check_teacher_fits, load_teacher
+from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.replay.memory import Batch, FrameMemory
 from lerobot_agpd.replay.normalisation import Statistics
 from lerobot_agpd.replay.replay import ROW, Replay
@@ -46,6 +52,9 @@ if TYPE_CHECKING:
     from lerobot_agpd.distill.student import DistilledStudent
 
 logger = logging.getLogger(__name__)
+
+PROPOSALS = 2
+"""Stream of the noise that students draw from torch's own generator; the teacher's noise is stream 1."""
 
 
 class Distillation:
@@ -78,6 +87,7 @@ class Distillation:
         self.demonstrations = memory.dataset.meta
         self.replay = Replay(memory, self.config, self.config.replay.collected_share)
         self.replay.seen_episodes.update(self.state.seen_episodes)
+        self.own_teacher = self._make_own_teacher()
         self.teacher = self._load_teacher()
         self.rounds = self._make_rounds()
         self.teacher_chunks = self._make_teacher_chunks()
@@ -88,22 +98,40 @@ class Distillation:
 
     @property
     def needs_teacher(self) -> bool:
-        """Whether any part of the method uses the teacher."""
-        return self.config.collect.enabled or self.config.adversary.weight > 0
+        """Whether any part of the method uses a teacher of its own; in self-distillation none does."""
+        config = self.config
+        used = config.collect.enabled or config.adversary.weight > 0 or config.replay.relabel != "none"
+        return used and self.own_teacher is None
 
-    def _load_teacher(self) -> DiffusionTeacher | None:
+    def _make_own_teacher(self) -> OwnTeacher | None:
+        """Without a teacher's path, a student that can teach itself does (Table 1)."""
+        if self.config.teacher.path or not self.student.can_teach_itself:
+            return None
+        if self.config.replay.relabel != "none":
+            raise ValueError(
+                f"--policy.replay.relabel={self.config.replay.relabel} needs a teacher (--policy.teacher.path); in "
+                "self-distillation the only one is the student"
+            )
+        own_teacher = OwnTeacher(self.student)
+        if self.state.checkpoint is not None:
+            own_teacher.restore(Path(self.state.checkpoint))
+        return own_teacher
+
+    def _load_teacher(self) -> Teacher | None:
         if not self.needs_teacher:
             return None
         teacher = load_teacher(self.config.teacher, self.config.device)
         check_teacher_fits(
-            teacher, self.student.demonstrated_features(self.demonstrations), self.config.action_feature
+            teacher,
+            self.student.demonstrated_features(self.demonstrations),
+            self.config.action_feature,
+            self.config.guidance if self.config.collect.guides else None,
         )
         return teacher
 
     def _make_rounds(self) -> RoundRunner | None:
         if not self.config.collect.enabled:
             return None
-        assert self.teacher is not None
         env_config = run_environment(self.config.collect, self.run)
         check_environment_fits(env_config, self.config, self.teacher)
         root = replay_root(self.config.replay, self.run, self.state)
@@ -119,10 +147,11 @@ class Distillation:
         )
 
     def _make_teacher_chunks(self) -> TeacherChunks | None:
-        if self.config.adversary.weight == 0:
+        if self.teacher is None or (
+            self.config.adversary.weight == 0 and self.config.replay.relabel == "none"
+        ):
             return None
-        assert self.teacher is not None
-        return TeacherChunks(self.teacher, self.replay, self.config.chunk_size, self.seed)
+        return TeacherChunks(self.teacher, self.replay, future_steps(self.config), self.seed)
 
     def _adopt_finished_rounds(self) -> None:
         """Load the rounds on disk: those of the checkpoint, and those finished after it was written."""
@@ -151,20 +180,33 @@ class Distillation:
             hash((self.seed, self.rank, self.state.updates))
             % 2**63  # stateless: resuming draws the same rows
         )
-        return self.replay.training_rows(batch, generator)
+        rows = self.replay.training_rows(batch, generator)
+        return self._relabelled(rows) if self.config.replay.relabel != "none" else rows
 
     def held_out_rows(self, batch: Batch) -> Batch:
         """A batch of demonstrations alone."""
         self.replay.memory.observe(batch)
         return self.replay.demonstration_rows(batch)
 
+    def _relabelled(self, rows: Batch) -> Batch:
+        """Rows whose recorded chunks are exchanged for the teacher's own, as `replay.relabel` says."""
+        assert self.teacher_chunks is not None
+        chunks, shared = self.teacher_chunks.at(rows[ROW], self.replay.seen_episodes)
+        chosen = torch.ones_like(rows[ROW], dtype=torch.bool)
+        if self.config.replay.relabel == "demonstrations":
+            chosen = rows[ROW] < self.replay.n_demonstration_frames
+        present = self.config.chunk_offsets.index(0)
+        action, is_pad = rows[ACTION].clone(), rows["action_is_pad"].clone()
+        action[chosen, present : present + shared] = chunks[chosen, :shared]
+        is_pad[chosen, present : present + shared] = False
+        is_pad[chosen, present + shared :] = True  # the teacher says nothing of these steps
+        return {**rows, ACTION: action, "action_is_pad": is_pad}
+
     # ---- stage 1: guided collection ----
 
     @property
     def scale(self) -> float:
         """Guidance scale of the next round."""
-        if self.config.collect.strategy == "replay":
-            return 0.0
         return float(self.reports[-1]["next_scale"]) if self.reports else self.config.guidance.scale
 
     def collect_round(self) -> Mapping[str, Any]:
@@ -172,11 +214,14 @@ class Distillation:
         assert self.rounds is not None
         number, was_training = len(self.reports), self.student.training
         self.student.eval()
-        with seeded_context(self.seed):
-            records, seconds = self.rounds.collect(number, self.scale, self._make_decider(number))
-        self.student.train(was_training)
+        with seeded_context(noise_seed(self.seed, self.rank, number, stream=PROPOSALS)):
+            decider = self._make_decider(number)
+            scale = round_strength(self.config.collect, number, self.scale) if self._has_target else 0.0
+            records, seconds = self.rounds.collect(number, scale, decider)
         if self.rank == 0:
-            self.rounds.finish(number, self._report(number, records, seconds))
+            diagnostics = self.rounds.diagnose(number, scale, decider)
+            self.rounds.finish(number, self._report(number, scale, records, seconds, diagnostics))
+        self.student.train(was_training)
         barrier()
         round_ = self.rounds.store.rounds()[number]
         for dataset in round_.datasets:
@@ -184,22 +229,36 @@ class Distillation:
         self.reports.append(round_.report)
         self.state.rounds = len(self.reports)
         if self.rank == 0:
-            _log_round(round_.report)
+            log_round(round_.report)
         return round_.report
 
-    def _make_decider(self, number: int) -> GuidedTeacher | TeacherAlone:
-        assert self.teacher is not None and self.rounds is not None
-        noise = self.rounds.noise(number)
-        if self.config.collect.strategy == "replay":
-            return TeacherAlone(self.teacher, executed_steps(self.config, self.teacher), noise)
-        return Proposer(self.student, self.replay.memory.normaliser).guided(self.teacher, noise)
+    @property
+    def _has_target(self) -> bool:
+        """Whether there is somebody to guide toward; a student that teaches itself first needs a previous self."""
+        return self.own_teacher is None or self.own_teacher.previous is not None
 
-    def _report(self, number: int, records: Any, seconds: Mapping[str, float]) -> dict[str, Any]:
+    def _make_decider(self, number: int) -> Decider:
         assert self.rounds is not None
-        report = self.rounds.report(number, self.scale, records, seconds)
+        normaliser, acting = self.replay.memory.normaliser, None
+        if self.own_teacher is not None:
+            self.teacher = self.own_teacher.refresh(normaliser.stats)
+            acting = self.own_teacher.previous
+        assert self.teacher is not None
+        return Proposer(self.student, normaliser, acting).decider(self.teacher, self.rounds.noise(number))
+
+    def _report(
+        self,
+        number: int,
+        scale: float,
+        records: Any,
+        seconds: Mapping[str, float],
+        diagnostics: Mapping[str, Any] | None,
+    ) -> dict[str, Any]:
+        assert self.rounds is not None
+        report = self.rounds.report(number, scale, records, seconds, diagnostics)
         report["updates"] = self.state.updates
         report["next_scale"] = self.scale
-        if self.config.collect.strategy == "guided":
+        if self.config.collect.guides:
             report["next_scale"] = next_scale(
                 self.scale,
                 success_rate([report["guided"]]),
@@ -217,20 +276,21 @@ class Distillation:
         for loss, entries in (self._adversarial_loss(rows), self._representation_loss(rows)):
             total = total + loss
             log |= entries
-        return total, log | self._round_log()
+        return total, log | {"collected_share": self.replay.share()} | round_scalars(self.reports)
 
     def _adversarial_loss(self, rows: Batch) -> tuple[Tensor | float, dict[str, float]]:
         config, updates = self.config.adversary, self.state.updates
-        if self.teacher_chunks is None or updates < config.start or updates % config.every:
+        if config.weight == 0 or updates < config.start or updates % config.every:
+            return 0.0, {}
+        rows, reference_chunk, compared = self._reference_chunks(rows)
+        if len(reference_chunk) == 0:
             return 0.0, {}
         assert self.student.discriminator is not None
-        teacher_chunk, shared = self.teacher_chunks.at(rows[ROW], self.replay.seen_episodes)
         student_chunk, embedding = self.student.prior_chunk(rows)
-        shared_steps = torch.arange(student_chunk.shape[1], device=student_chunk.device) < shared
         terms = adversary_terms(
             self.student.discriminator,
-            student_chunk * shared_steps[:, None],
-            teacher_chunk,
+            student_chunk * compared[..., None],
+            reference_chunk * compared[..., None],
             embedding,
             config,
         )
@@ -239,6 +299,22 @@ class Distillation:
             "adversarial_loss": terms.log_d.item(),
             "discriminator_accuracy": terms.accuracy.item(),
         }
+
+    def _reference_chunks(self, rows: Batch) -> tuple[Batch, Tensor, Tensor]:
+        """What D compares the student with: the teacher's own chunks, or what a self-taught student executed.
+
+        Returns:
+            The rows concerned, chunks (B, S, A) in the student's normalised space, and the mask (B, S) that is
+            True on the compared steps.
+        """
+        if self.teacher_chunks is not None:
+            chunks, shared = self.teacher_chunks.at(rows[ROW], self.replay.seen_episodes)
+            compared = torch.arange(chunks.shape[1], device=chunks.device) < shared
+            return rows, chunks, compared.expand(len(chunks), -1)
+        kept = rows[ROW] >= self.replay.n_demonstration_frames
+        rows = {key: value[kept] for key, value in rows.items()}
+        present = self.config.chunk_offsets.index(0)
+        return rows, rows[ACTION][:, present:], ~rows["action_is_pad"][:, present:]
 
     def _representation_loss(self, rows: Batch) -> tuple[Tensor | float, dict[str, float]]:
         representation = self.student.representation
@@ -249,22 +325,6 @@ class Distillation:
         predicted = representation(now, rows["action"][:, :n_steps])
         loss = reconstruction_loss(predicted, later, is_pad)
         return self.config.representation.weight * loss, {"representation_loss": loss.item()}
-
-    def _round_log(self) -> dict[str, float]:
-        log = {"collected_share": self.replay.share(), "rounds": float(len(self.reports))}
-        if self.reports:
-            report = self.reports[-1]
-            log["guidance_scale"] = self.scale
-            for kind in ("guided", "unguided"):
-                rate = success_rate([report[kind]])
-                if rate is not None:
-                    log[f"{kind}_success"] = rate
-            for key in ("generated", "successful", "kept"):
-                log[f"episodes_{key}"] = float(sum(past[key] for past in self.reports))
-            for key in ("mean_j_guided", "mean_shift_in_sigmas"):
-                if report[key] is not None:
-                    log[key.removeprefix("mean_")] = report[key]
-        return log
 
     # ---- alternation ----
 
@@ -281,28 +341,7 @@ class Distillation:
             self.rounds.merge()
 
     def save(self, folder: Path) -> None:
-        """Write the counters beside a checkpoint's weights."""
+        """Write what a resumed run must know beside a checkpoint's weights."""
         self.state.save(folder)
-
-
-def _log_round(report: Mapping[str, Any]) -> None:
-    rates = {kind: success_rate([report[kind]]) for kind in ("guided", "unguided")}
-    shown = {kind: "-" if rate is None else f"{rate:.2f}" for kind, rate in rates.items()}
-    logger.info(
-        "round %d: %d generated, %d successful, %d kept; success guided %s, unguided %s; scale %.3g -> %.3g; %.0f s",
-        report["round"],
-        report["generated"],
-        report["successful"],
-        report["kept"],
-        shown["guided"],
-        shown["unguided"],
-        report["scale"],
-        report["next_scale"],
-        sum(report["seconds"].values()),
-    )
-    if report["kept"] == 0:
-        logger.warning(
-            "round %d kept no episode: the student goes on with what it has. If this persists, the teacher is too "
-            "weak or the success filter too strict (--policy.collect.min_reward)",
-            report["round"],
-        )
+        if self.own_teacher is not None:
+            self.own_teacher.save(folder)

@@ -10,7 +10,7 @@ from lerobot.envs.utils import env_to_policy_features
 from lerobot.utils.constants import ACTION
 
 from lerobot_agpd.collect.config import CollectConfig
-from lerobot_agpd.guidance.teacher import DiffusionTeacher
+from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.run import RunInfo
 
 
@@ -29,14 +29,19 @@ def run_environment(config: CollectConfig, run: RunInfo) -> EnvConfig:
     return env_config
 
 
-def check_environment_fits(env_config: EnvConfig, policy_config: Any, teacher: DiffusionTeacher) -> None:
+def check_environment_fits(env_config: EnvConfig, policy_config: Any, teacher: Teacher | None) -> None:
     """Refuse an environment that does not deliver what student and teacher observe, or takes other actions.
+
+    Without a teacher (a student that teaches itself) only the student is checked.
 
     Raises:
         ValueError: listing both sides.
     """
     delivered = env_to_policy_features(env_config)
-    for who, needed in (("student", policy_config.input_features), ("teacher", teacher.input_features)):
+    observers = {"student": policy_config.input_features}
+    if teacher is not None:
+        observers["teacher"] = teacher.input_features
+    for who, needed in observers.items():
         missing = sorted(set(needed) - set(delivered))
         if missing:
             raise ValueError(

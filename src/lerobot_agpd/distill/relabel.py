@@ -9,7 +9,7 @@ import torch
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
-from lerobot_agpd.guidance.teacher import DiffusionTeacher
+from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.replay.replay import Replay
 
 logger = logging.getLogger(__name__)
@@ -23,15 +23,15 @@ class TeacherChunks:
     Args:
         teacher: the teacher.
         replay: T.
-        chunk_size: steps S of the student's chunk.
+        n_chunk_steps: steps S of the student's chunk from the current one on.
         seed: of the sampling noise.
     """
 
-    def __init__(self, teacher: DiffusionTeacher, replay: Replay, chunk_size: int, seed: int):
+    def __init__(self, teacher: Teacher, replay: Replay, n_chunk_steps: int, seed: int):
         self.teacher = teacher
         self.replay = replay
-        self.n_shared = min(chunk_size, teacher.n_chunk_steps)
-        self.chunk_size = chunk_size
+        self.n_shared = min(n_chunk_steps, teacher.n_chunk_steps)
+        self.n_chunk_steps = n_chunk_steps
         self.seed = seed
         self.seconds = 0.0
         self._chunks: Tensor | None = None  # (N, S, A) student-normalised, NaN where not sampled yet
@@ -52,7 +52,7 @@ class TeacherChunks:
         known = 0 if self._chunks is None else len(self._chunks)
         if known < n_rows:
             action_dim = self.replay.table.columns[ACTION].shape[1]
-            empty = torch.full((n_rows - known, self.chunk_size, action_dim), float("nan"), device=device)
+            empty = torch.full((n_rows - known, self.n_chunk_steps, action_dim), float("nan"), device=device)
             self._chunks = empty if self._chunks is None else torch.cat([self._chunks, empty])
         assert self._chunks is not None
         return self._chunks

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from lerobot.configs import PolicyFeature
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import OBS_PREFIX
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from lerobot.utils.random_utils import seeded_context
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 from lerobot_agpd.distill.adversary import Discriminator
 from lerobot_agpd.distill.distillation import Distillation
 from lerobot_agpd.distill.gradient_norms import GradientNorms
+from lerobot_agpd.distill.guided import future_steps
 from lerobot_agpd.guidance.representation import StateRepresentation
 from lerobot_agpd.replay.memory import delivers_single_frames
 from lerobot_agpd.replay.normalisation import Statistics
@@ -29,10 +31,15 @@ class DistilledStudent(nn.Module):
     """Mixin: a policy trained by AGPD in LeRobot's own training loop.
 
     In eval mode it is the policy it is mixed into, and it loads without teacher, dataset or environment. A
-    concrete class names this mixin before LeRobot's policy and implements `prior_chunk` and `embedding_dim`.
+    concrete class names this mixin before LeRobot's policy and implements `prior_chunk` and `embedding_dim`; one
+    that denoises also implements `snapshot` and can then teach itself. Its configuration says which steps a chunk
+    covers (`chunk_offsets`) and how many observations it looks at (`observation_history`).
     """
 
     config: Any
+    can_teach_itself = False
+    optional_weights: tuple[str, ...] = ("discriminator", "representation")
+    """Parts that a checkpoint may lack: a student may be started with an adversary that it was saved without."""
 
     if TYPE_CHECKING:
 
@@ -45,13 +52,22 @@ class DistilledStudent(nn.Module):
 
     @abstractmethod
     def prior_chunk(self, rows: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """The chunk that would be executed, and an embedding of the observation.
+        """The student's chunk as the discriminator sees it, and an embedding of the observation.
 
-        Must not look at the recorded actions (ACT in training mode does).
+        For a policy that predicts in one go this is the chunk that would be executed, and must not look at the
+        recorded actions (ACT in training mode does). A policy that denoises returns the clean chunk that one
+        denoising step estimates, so that nothing is backpropagated through its sampling.
 
         Returns:
-            Chunks (B, S, A) with gradients, in the student's normalised space, and embeddings (B, E).
+            Chunks (B, S, A) from the current step on, with gradients, in the student's normalised space, and
+            embeddings (B, E).
         """
+
+    def snapshot(self) -> PreTrainedPolicy:
+        """A frozen copy of the policy as it would be evaluated now, without what only trains it."""
+        raise NotImplementedError(
+            f"a '{self.config.type}' policy cannot teach itself: set --policy.teacher.path"
+        )
 
     def init_distillation(
         self, dataset_meta: LeRobotDatasetMetadata | None, dataset_stats: Statistics | None
@@ -62,7 +78,7 @@ class DistilledStudent(nn.Module):
         self.discriminator: Discriminator | None = None
         if config.adversary.weight > 0:
             self.discriminator = Discriminator(
-                config.chunk_size, action_dim, self.embedding_dim, config.adversary
+                future_steps(config), action_dim, self.embedding_dim, config.adversary
             )
         self.representation: StateRepresentation | None = None
         if config.representation.type == "state":
@@ -98,6 +114,8 @@ class DistilledStudent(nn.Module):
 
     def update(self) -> None:
         """Advance the alternation; LeRobot calls this after every optimizer step, on every process."""
+        if hasattr(super(), "update"):
+            super().update()
         if self._distillation is not None:
             self._distillation.after_update()
 
@@ -142,8 +160,7 @@ class DistilledStudent(nn.Module):
 
     @classmethod
     def _load_as_safetensor(cls, model: Any, model_file: str, map_location: str, strict: bool) -> Any:
-        # A student may be started with an adversary or a representation that its checkpoint had none of.
-        require_weights(model, model_file, optional=("discriminator", "representation"))
+        require_weights(model, model_file, optional=cls.optional_weights)
         return super()._load_as_safetensor(model, model_file, map_location, strict)  # type: ignore[misc]
 
     # ---- features ----

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_agpd.envs.gymnasium_robotics import AGENT_POS, ENVIRONMENT_STATE
+from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE
 
 Array = NDArray[np.float64]
 Expert = Callable[[dict[str, np.ndarray]], np.ndarray]

@@ -17,11 +17,11 @@ def require(condition: bool, message: str) -> None:
 
 @dataclass
 class TeacherConfig:
-    """The frozen diffusion policy to learn from."""
+    """The frozen policy to learn from (docs/teachers.md)."""
 
-    path: str = ""  # checkpoint folder or Hub repository of a diffusion policy; empty: no teacher
+    path: str = ""  # checkpoint folder or Hub repository of a LeRobot policy; empty: no teacher
     num_inference_steps: int | None = None  # denoising steps while collecting; default: the checkpoint's
-    noise_scheduler: str | None = None  # DDPM or DDIM while collecting; default: the checkpoint's
+    noise_scheduler: str | None = None  # DDPM or DDIM (diffusion only); default: the checkpoint's
 
     def __post_init__(self) -> None:
         require(
@@ -39,7 +39,7 @@ class GuidanceConfig:
     """How strongly, and where, the teacher's denoising is pulled toward the student (Eq. 20)."""
 
     scale: float = 0.5  # k of the first round; positive pulls toward the student, 0 switches guidance off
-    at: str = "x0"  # where J is differentiated: the predicted clean chunk (x0) or the posterior mean (mu, as printed)
+    at: str = "x0"  # where J is differentiated: predicted clean chunk (x0), or posterior mean (mu, as printed; not flows)
     trust_region: float = 1.0  # largest shift of a denoising step, as a multiple of that step's sigma
     adaptive: bool = True  # adapt the scale from round to round to keep the teacher's success rate
     growth: float = 2.0  # factor by which the scale grows after a good round and shrinks after a bad one

@@ -70,7 +70,8 @@ class Guide:
         scale: (B,) guidance scale of every row; rows at 0 are sampled exactly as without a guide.
         at: "x0" or "mu", where J is differentiated.
         trust_region: largest root-mean-square shift over the guided entries, in sigmas.
-        callback: called with a dict after every step (`timestep`, `sigma`, `j`, `shift`, `x0_hat`).
+        callback: called with a dict after every step (`timestep`, `sigma`, `j`, `shift`, `x0_hat`); the timestep
+            is the diffusion step k, or the time tau of a flow.
         shift_in_sigmas: per step, (B,) root-mean-square shift divided by sigma; filled while sampling.
         j: per step, (B,) J where it was differentiated; filled while sampling.
     """
@@ -83,8 +84,8 @@ class Guide:
     shift_in_sigmas: list[Tensor] = field(default_factory=list)
     j: list[Tensor] = field(default_factory=list)
 
-    def shift(self, step: Posterior, timestep: int) -> Tensor:
-        """What to add to x_{k-1}, (B, H, A).
+    def shift(self, step: Posterior, timestep: float) -> Tensor:
+        """What to add to x_{k-1} (of a flow: to x0_hat), (B, H, A).
 
         Two caps make up the trust region. scale * sigma^2 is cut at 1, where the explicit step of the
         quadratic J lands on the student (beyond 2 it would diverge). Then the step's length is cut at

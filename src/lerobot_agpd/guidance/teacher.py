@@ -1,50 +1,96 @@
-"""A frozen LeRobot diffusion policy as a teacher: its own processors, batched chunks, guided or not."""
+"""A pretrained LeRobot policy as a teacher: its own processors, batched chunks, guided where it denoises.
+
+How a policy is sampled is the business of an adapter, one small class per family of policies:
+
+    policy                      adapter                          guided by
+    diffusion and subclasses    adapters/diffusion.py            the scheduler's step
+    multi_task_dit              adapters/flow.py                 the scheduler's step, or the velocity
+    pi0, pi05, smolvla          adapters/rtc.py                  the velocity, through LeRobot's RTC hook
+    any other                   adapters/chunk.py                - (it can be replayed and mixed)
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from typing import Any, ClassVar
 
 import torch
-from diffusers.schedulers.scheduling_ddim import DDIMScheduler
-from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
-from lerobot.configs import PolicyFeature, PreTrainedConfig
+from lerobot.configs import PolicyFeature
 from lerobot.lerobot_types import TransitionKey
-from lerobot.policies import get_policy_class, make_pre_post_processors
-from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
-from lerobot.processor import NormalizerProcessorStep, PolicyAction, PolicyProcessorPipeline
-from lerobot.utils.constants import ACTION, OBS_IMAGES
+from lerobot.policies import PreTrainedPolicy
+from lerobot.processor import (
+    NormalizerProcessorStep,
+    PolicyAction,
+    PolicyProcessorPipeline,
+    RelativeActionsProcessorStep,
+    TokenizerProcessorStep,
+)
+from lerobot.utils.constants import ACTION
+from lerobot.utils.random_utils import seeded_context
 from torch import Tensor
 
-from lerobot_agpd.guidance.config import TeacherConfig
-from lerobot_agpd.guidance.guide import Guide, guided
-
-SCHEDULER_CLASSES = {"DDPM": DDPMScheduler, "DDIM": DDIMScheduler}
+from lerobot_agpd.guidance.config import GUIDANCE_POINTS
+from lerobot_agpd.guidance.guide import Guide
 
 Features = Mapping[str, PolicyFeature]
 
+History = Mapping[str, Any]
+"""Raw observations per feature, (B, T, ...), and under "task" B instructions where the teacher reads them."""
 
-class DiffusionTeacher:
-    """Samples chunks from a frozen diffusion policy; keeps no state between calls.
+TASK = "task"
+
+
+class Teacher(ABC):
+    """Samples chunks from a policy; keeps no state between calls.
 
     It is deliberately not an nn.Module: as an attribute of a student it must not enter the student's
-    state_dict, DDP or `.to()`.
+    state_dict, DDP or `.to()`. Building one neither copies nor changes the policy, so a policy that is still
+    in training can be its own teacher.
+
+    Attributes:
+        can_be_guided: whether `sample` takes a guide.
     """
+
+    can_be_guided: ClassVar[bool]
 
     def __init__(
         self,
-        policy: DiffusionPolicy,
+        policy: PreTrainedPolicy,
         preprocessor: PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
         postprocessor: PolicyProcessorPipeline[PolicyAction, PolicyAction],
     ):
-        """Freeze the policy and keep its processors."""
-        self.policy = policy.eval().requires_grad_(False)
+        """Wrap a policy and its processors.
+
+        Raises:
+            ValueError: if its action space depends on the observation or is not known.
+        """
+        self.policy: Any = policy
         self._preprocessor = preprocessor
         self._postprocessor = postprocessor
-        self._normaliser = next(
-            step for step in preprocessor.steps if isinstance(step, NormalizerProcessorStep)
-        )
+        normalisers = [step for step in preprocessor.steps if isinstance(step, NormalizerProcessorStep)]
+        if not normalisers:
+            raise ValueError(
+                f"the preprocessor of the {self.type} teacher has no normaliser, so its action space is unknown; "
+                f"its steps are {[type(step).__name__ for step in preprocessor.steps]}"
+            )
+        self._normaliser = normalisers[0]
+        if any(
+            isinstance(step, RelativeActionsProcessorStep) and step.enabled for step in preprocessor.steps
+        ):
+            raise ValueError(
+                f"the {self.type} teacher predicts actions relative to the current state "
+                "(use_relative_actions=true), which cannot be compared with a student's; use a teacher trained "
+                "with use_relative_actions=false"
+            )
+
+    # ---- what it is ----
+
+    @property
+    def type(self) -> str:
+        """Its policy type, quoted, for messages."""
+        return f"'{self.policy.config.type}'"
 
     @property
     def n_obs_steps(self) -> int:
@@ -54,12 +100,12 @@ class DiffusionTeacher:
     @property
     def start(self) -> int:
         """Index of the current step in its internal chunk."""
-        return self.n_obs_steps - 1
+        return 0
 
     @property
+    @abstractmethod
     def n_chunk_steps(self) -> int:
         """Steps of a chunk from the current one on."""
-        return self.policy.config.horizon - self.start
 
     @property
     def n_action_steps(self) -> int:
@@ -76,6 +122,23 @@ class DiffusionTeacher:
         """Its action space."""
         return self.policy.config.output_features[ACTION]
 
+    @property
+    def resizes_images(self) -> bool:
+        """Whether it accepts images of any size."""
+        return False
+
+    @property
+    def needs_task(self) -> bool:
+        """Whether it reads an instruction."""
+        return any(isinstance(step, TokenizerProcessorStep) for step in self._preprocessor.steps)
+
+    @property
+    def guidance_points(self) -> tuple[str, ...]:
+        """Where J can be differentiated (`--policy.guidance.at`)."""
+        return GUIDANCE_POINTS if self.can_be_guided else ()
+
+    # ---- action spaces ----
+
     def to_units(self, actions_raw: Tensor) -> Tensor:
         """Raw actions (..., A) in the teacher's normalised space."""
         return self._normaliser({TransitionKey.ACTION: actions_raw})[TransitionKey.ACTION]
@@ -84,120 +147,131 @@ class DiffusionTeacher:
         """Actions (..., A) of the teacher's normalised space in the environment's units."""
         return self._postprocessor(actions).to(actions.device)
 
+    # ---- sampling ----
+
     @torch.no_grad()
     def sample(
-        self,
-        history: Mapping[str, Tensor],
-        guide: Guide | None = None,
-        generator: torch.Generator | None = None,
+        self, history: History, guide: Guide | None = None, generator: torch.Generator | None = None
     ) -> Tensor:
         """Predict chunks.
 
         Args:
-            history: raw observations per feature, (B, n_obs_steps, ...), images as floats in [0, 1].
+            history: raw observations per feature, (B, T, ...), of which the last n_obs_steps are used, images as
+                floats in [0, 1]; under "task" B strings, if the teacher reads instructions.
             guide: pulls rows toward another chunk; rows with scale 0 equal unguided ones bit for bit.
-            generator: source of the sampling noise.
+            generator: source of the sampling noise; default: torch's global one.
 
         Returns:
             (B, n_chunk_steps, A) raw actions from the current step on.
-        """
-        batch = self._prepare(history)
-        model = self.policy.diffusion
-        condition = model._prepare_global_conditioning(batch)  # (B, C)
-        with guided(model, guide):
-            chunk = model.conditional_sample(len(condition), global_cond=condition, generator=generator)
-        return self.to_raw(chunk[:, self.start :])
 
-    def _prepare(self, history: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Run the teacher's preprocessor on every step of the history and stack its cameras."""
-        missing = [key for key in self.input_features if key not in history]
+        Raises:
+            KeyError: if the history lacks a feature or the instruction.
+            ValueError: if the history is too short, or the teacher cannot be guided this way.
+        """
+        if guide is not None:
+            self.require_guidance(guide.at)
+        with _eval_mode(self.policy):
+            chunk = self._sample_chunk(self._prepare(history), guide, generator)  # (B, H, A)
+        return self.to_raw(chunk[:, self.start : self.start + self.n_chunk_steps])
+
+    @abstractmethod
+    def _sample_chunk(
+        self, batch: dict[str, Any], guide: Guide | None, generator: torch.Generator | None
+    ) -> Tensor:
+        """The whole internal chunk, (B, H, A), in the teacher's normalised space; called inside no_grad.
+
+        Args:
+            batch: preprocessed features (B, n_obs_steps, ...), and whatever else the preprocessor made of the
+                last step (B, ...), such as language tokens.
+            guide: None, or one that this teacher takes (`require_guidance`).
+            generator: of the noise; `seeded_by` serves code that takes none.
+        """
+
+    def require_guidance(self, at: str) -> None:
+        """Refuse guidance that this teacher cannot follow.
+
+        Raises:
+            ValueError: if it cannot be guided, or not at this point.
+        """
+        if not self.can_be_guided:
+            raise ValueError(
+                f"a {self.type} teacher predicts its chunk in one pass, so there is no denoising to guide; the "
+                "collection strategies that replay it or mix its actions with the student's are for it "
+                "(--policy.collect.strategy=replay), guidance needs a diffusion or flow-matching teacher"
+            )
+        if at not in self.guidance_points:
+            raise ValueError(
+                f"--policy.guidance.at={at} has no meaning for this {self.type} teacher: a flow has no posterior "
+                f"mean; use --policy.guidance.at={self.guidance_points[0]}"
+            )
+
+    def set_sampler(self, num_inference_steps: int | None, noise_scheduler: str | None) -> None:
+        """Sample otherwise than the checkpoint says; None keeps its way.
+
+        Raises:
+            ValueError: if the teacher has no such setting, or not with this value.
+        """
+        if num_inference_steps is not None:
+            raise self.no_such_setting(
+                "num_inference_steps", num_inference_steps, "does not denoise in steps"
+            )
+        if noise_scheduler is not None:
+            raise self.no_such_setting("noise_scheduler", noise_scheduler, "has no noise scheduler")
+
+    def no_such_setting(self, name: str, value: object, why: str) -> ValueError:
+        """The error for a `--policy.teacher.*` flag that means nothing to this teacher."""
+        return ValueError(
+            f"--policy.teacher.{name}={value} has no meaning for this {self.type} teacher, which {why}; leave "
+            "the flag out"
+        )
+
+    # ---- observations ----
+
+    def _prepare(self, history: History) -> dict[str, Any]:
+        """Run the preprocessor on each of the last n_obs_steps observations."""
+        keys, n_obs = list(self.input_features), self.n_obs_steps
+        missing = [key for key in keys if key not in history]
         if missing:
             raise KeyError(f"the teacher needs {missing}; it was given {sorted(history)}")
-        n_obs = self.n_obs_steps
-        batch_size = len(next(iter(history.values())))
-        flat = {key: history[key].flatten(0, 1) for key in self.input_features}
-        processed = self._preprocessor(flat)
-        batch = {key: processed[key].unflatten(0, (batch_size, n_obs)) for key in self.input_features}
-        cameras = list(self.policy.config.image_features)
-        if cameras:
-            batch[OBS_IMAGES] = torch.stack([batch[key] for key in cameras], dim=-4)
+        if self.needs_task and TASK not in history:
+            raise KeyError(
+                f"the {self.type} teacher follows instructions: the history must hold 'task', one string per row; "
+                f"it was given {sorted(history)}"
+            )
+        batch_size, length = history[keys[0]].shape[:2]
+        if length < n_obs:
+            raise ValueError(f"the teacher needs {n_obs} observations in a row, it was given {length}")
+        flat: dict[str, Any] = {key: history[key][:, -n_obs:].flatten(0, 1) for key in keys}
+        if TASK in history:
+            flat[TASK] = [task for task in history[TASK] for _ in range(n_obs)]
+        batch = {}
+        for key, value in self._preprocessor(flat).items():
+            if isinstance(value, Tensor) and value.shape[:1] == (batch_size * n_obs,):
+                rows = value.unflatten(0, (batch_size, n_obs))
+                batch[key] = rows if key in keys else rows[:, -1]
         return batch
 
+    def _now(self, batch: dict[str, Any]) -> dict[str, Any]:
+        """The prepared batch at the current step alone, (B, ...), for policies that take no history."""
+        return {key: value[:, -1] if key in self.input_features else value for key, value in batch.items()}
 
-def load_teacher(config: TeacherConfig, device: str) -> DiffusionTeacher:
-    """Load the teacher that `--policy.teacher.path` names.
 
-    Raises:
-        ValueError: if no path is given or the checkpoint is not a diffusion policy.
-        FileNotFoundError: if there is no policy at the path.
-    """
-    if not config.path:
-        raise ValueError(
-            "--policy.teacher.path is not set: AGPD distils a diffusion policy, so name a checkpoint folder or a "
-            "Hub repository. To clone the demonstrations alone, pass --policy.collect.every=0 "
-            "--policy.adversary.weight=0"
-        )
+@contextmanager
+def _eval_mode(policy: PreTrainedPolicy) -> Iterator[None]:
+    """Evaluate the policy, and leave it in the mode in which it was."""
+    was_training = policy.training
+    if was_training:
+        policy.eval()
     try:
-        policy_config = PreTrainedConfig.from_pretrained(config.path)
-    except Exception as error:
-        raise FileNotFoundError(
-            f"--policy.teacher.path='{config.path}' is neither a folder with a policy's config.json nor a Hub "
-            f"repository that can be reached ({error})"
-        ) from error
-    policy_class = get_policy_class(policy_config.type)
-    if not issubclass(policy_class, DiffusionPolicy):
-        raise ValueError(
-            f"--policy.teacher.path='{config.path}' is a '{policy_config.type}' policy; guidance needs one that "
-            "denoises (type 'diffusion' or a subclass of it, such as 'diffusion_transformer')"
-        )
-    policy_config.device = device
-    policy_config.pretrained_path = Path(config.path)
-    policy = policy_class.from_pretrained(config.path, config=policy_config)
-    _set_sampler(policy, config)
-    preprocessor, postprocessor = make_pre_post_processors(
-        policy_config,
-        pretrained_path=config.path,
-        preprocessor_overrides={"device_processor": {"device": device}},
-    )
-    return DiffusionTeacher(policy, preprocessor, postprocessor)
+        yield
+    finally:
+        if was_training:
+            policy.train()
 
 
-def _set_sampler(policy: DiffusionPolicy, config: TeacherConfig) -> None:
-    model = policy.diffusion
-    if config.noise_scheduler is not None:
-        scheduler_class = SCHEDULER_CLASSES[config.noise_scheduler]
-        model.noise_scheduler = scheduler_class.from_config(model.noise_scheduler.config)
-    if config.num_inference_steps is not None:
-        limit = model.noise_scheduler.config.num_train_timesteps
-        if config.num_inference_steps > limit:
-            raise ValueError(
-                f"--policy.teacher.num_inference_steps={config.num_inference_steps} exceeds the {limit} "
-                "diffusion steps the teacher was trained with"
-            )
-        model.num_inference_steps = config.num_inference_steps
-
-
-def check_teacher_fits(teacher: DiffusionTeacher, available: Features, action: PolicyFeature) -> None:
-    """Refuse a teacher that the observations or the action space at hand cannot serve.
-
-    Args:
-        teacher: the teacher.
-        available: observation features that the demonstrations hold (and the environment delivers).
-        action: the student's action feature.
-
-    Raises:
-        ValueError: listing both sides.
-    """
-    needed = {key: tuple(ft.shape) for key, ft in teacher.input_features.items()}
-    given = {key: tuple(ft.shape) for key, ft in available.items()}
-    wrong = {key: shape for key, shape in needed.items() if given.get(key) != shape}
-    if wrong:
-        raise ValueError(
-            f"the teacher (--policy.teacher.path) needs the observations {needed}, the demonstrations hold "
-            f"{given}; they differ in {sorted(wrong)}"
-        )
-    if tuple(teacher.action_feature.shape) != tuple(action.shape):
-        raise ValueError(
-            f"the teacher's actions have shape {tuple(teacher.action_feature.shape)}, the demonstrations' "
-            f"{tuple(action.shape)}: choose a teacher of the same action space (--policy.teacher.path)"
-        )
+def seeded_by(generator: torch.Generator | None) -> Any:
+    """Context in which global random numbers follow from the generator, and are as before afterwards."""
+    if generator is None:
+        return nullcontext()
+    seed = torch.randint(2**32, (), generator=generator, device=generator.device)
+    return seeded_context(int(seed))

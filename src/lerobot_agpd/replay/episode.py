@@ -14,11 +14,19 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Ticket:
-    """An episode to be collected: its number in the round, the environment's seed and the guidance scale."""
+    """An episode to be collected.
+
+    Attributes:
+        number: in the round.
+        seed: the environment's.
+        scale: guidance scale, or mixing weight; 0: the teacher as it acts alone.
+        student_share: share of the longest possible episode in which the student acts before the teacher does.
+    """
 
     number: int
     seed: int
     scale: float
+    student_share: float = 0.0
 
     @property
     def guided(self) -> bool:
@@ -39,6 +47,8 @@ class Episode:
         successes: (T,) bool, or None if the environment reports no `is_success`.
         j: mean discrepancy of its decisions' executed chunks (action J), NaN without a student.
         shift: mean root-mean-square shift of its guided denoising steps, in sigmas; NaN if unguided.
+        student_steps: steps that the student executed before the teacher took over.
+        student_alone: whether the episode ended before the teacher took over.
     """
 
     ticket: Ticket
@@ -49,6 +59,8 @@ class Episode:
     successes: Array | None
     j: float
     shift: float
+    student_steps: int = 0
+    student_alone: bool = False
 
     def __len__(self) -> int:
         """Number of steps T."""
@@ -91,6 +103,8 @@ class Episode:
                 successes=arrays["successes"] if "successes" in arrays.files else None,
                 j=record.j,
                 shift=record.shift,
+                student_steps=record.student_steps,
+                student_alone=record.student_alone,
             )
 
 
@@ -102,6 +116,8 @@ class EpisodeRecord:
         passed: whether it met the success filter's criterion.
         trivial: whether its start already met it, or it was too short to teach anything; counts nowhere.
         kept: whether it entered the replay.
+        student_steps: steps that the student executed before the teacher took over.
+        student_alone: whether the episode ended before the teacher took over.
     """
 
     number: int
@@ -115,6 +131,8 @@ class EpisodeRecord:
     kept: bool
     j: float = field(default=float("nan"))
     shift: float = field(default=float("nan"))
+    student_steps: int = 0
+    student_alone: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """A JSON object; NaN becomes null."""

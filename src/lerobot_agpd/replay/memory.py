@@ -132,7 +132,11 @@ class FrameMemory:
 
 
 def gather_rows(
-    table: FrameTable, index: Tensor, config: PreTrainedConfig, action_offsets: Tensor, n_obs_steps: int
+    table: FrameTable,
+    index: Tensor,
+    config: PreTrainedConfig,
+    action_offsets: Tensor,
+    n_obs_steps: int | None,
 ) -> Batch:
     """Rows of a table as a policy's forward wants them.
 
@@ -141,18 +145,18 @@ def gather_rows(
         index: (B,) rows of the current observations.
         config: names the features.
         action_offsets: (H,) steps of the action chunk relative to the current one.
-        n_obs_steps: length of the observation history; 1 drops the time dimension, as LeRobot's loader does
-            for policies that ask for none.
+        n_obs_steps: length of the observation history; None leaves the time dimension out, as LeRobot's loader
+            does for policies that ask for no history.
 
     Returns:
-        Observations (B, [n_obs_steps,] D), `action` (B, H, A) and `action_is_pad` (B, H).
+        Observations (B, n_obs_steps, D) or (B, D), `action` (B, H, A) and `action_is_pad` (B, H).
     """
     rows: Batch = {}
-    history = torch.arange(1 - n_obs_steps, 1)
+    history = torch.arange(1 - (n_obs_steps or 1), 1)
     for key in low_dimensional_keys(config):
         if key == ACTION:
             rows[ACTION], rows["action_is_pad"] = table.gather(ACTION, index, action_offsets)
         elif key in table.columns:
             values, _ = table.gather(key, index, history)
-            rows[key] = values if n_obs_steps > 1 else values[:, 0]
+            rows[key] = values[:, 0] if n_obs_steps is None else values
     return rows

@@ -47,6 +47,7 @@ class Normaliser:
 
     def __init__(self, config: PreTrainedConfig, stats: Statistics):
         """Normalise the features of `config` in the way its `normalization_mapping` says."""
+        self.stats = stats
         arguments: dict[str, Any] = {
             "features": {**(config.input_features or {}), **(config.output_features or {})},
             "norm_map": config.normalization_mapping,

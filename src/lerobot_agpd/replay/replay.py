@@ -30,7 +30,8 @@ class Replay:
 
     Args:
         memory: the demonstrations.
-        config: the student's configuration.
+        config: the student's configuration; its `chunk_offsets` are the steps of a chunk relative to the current
+            one, its `observation_history` the steps of an observation (None: no time dimension).
         collected_share: share of rows exchanged; None draws uniformly from T.
     """
 
@@ -43,7 +44,9 @@ class Replay:
         self._table: FrameTable | None = None
         self._raw: FrameTable | None = None
         self._sources: list[tuple[int, LeRobotDataset]] = [(0, memory.dataset)]
-        self._action_offsets = torch.arange(config.chunk_size)
+        self._tasks: dict[int, list[str]] = {0: _tasks(memory.dataset)}
+        self._action_offsets = torch.as_tensor(config.chunk_offsets)
+        self._n_obs_steps: int | None = config.observation_history
         self._cameras = list(config.image_features)
 
     # ---- contents ----
@@ -80,7 +83,9 @@ class Replay:
         """Append the episodes of a finished round's dataset."""
         dataset = LeRobotDataset(f"agpd/{root.parent.name}-{root.name}", root=root)
         frames = FrameTable.from_dataset(dataset, self.memory.keys)
-        self._sources.append((self.n_demonstration_frames + self.n_collected_frames, dataset))
+        start = self.n_demonstration_frames + self.n_collected_frames
+        self._sources.append((start, dataset))
+        self._tasks[start] = _tasks(dataset)
         self.collected_raw = frames if self.collected_raw is None else self.collected_raw.concatenated(frames)
         self._table = self._raw = None
 
@@ -112,34 +117,49 @@ class Replay:
         if n_exchanged:
             draws = torch.randint(self.n_collected_frames, (n_exchanged,), generator=generator)
             rows[exchanged.to(rows.device)] = (self.n_demonstration_frames + draws).to(rows)
-        composed = self._gather(batch, rows)
-        for key in self._cameras if n_exchanged else ():
-            composed[key] = batch[key].clone()
-            for position in exchanged.nonzero()[:, 0].tolist():
-                image = self.image(int(rows[position]), key)
-                composed[key][position] = self.memory.normaliser.normalise(key, image).to(batch[key])
-        return composed
+        return self._gather(batch, rows)
 
     def demonstration_rows(self, batch: Batch) -> Batch:
         """The loader's frames with their chunks, for a held-out loss."""
         return self._gather(batch, batch["index"])
 
     def _gather(self, batch: Batch, rows: Tensor) -> Batch:
-        gathered = gather_rows(self.table, rows, self.config, self._action_offsets, n_obs_steps=1)
-        return {**{key: batch[key] for key in self._cameras}, **gathered, ROW: rows}
+        gathered = gather_rows(self.table, rows, self.config, self._action_offsets, self._n_obs_steps)
+        images = {key: self._images(batch, rows, key) for key in self._cameras}
+        return {**images, **gathered, ROW: rows}
+
+    def _images(self, batch: Batch, rows: Tensor, key: str) -> Tensor:
+        """A camera's normalised frames at `rows`; those that the loader did not deliver are read from disk."""
+        normalise = self.memory.normaliser.normalise
+        if self._n_obs_steps is not None:
+            return normalise(key, self.history(rows, [key], self._n_obs_steps)[key]).to(batch[key])
+        exchanged = (rows != batch["index"]).nonzero()[:, 0].tolist()
+        images = batch[key].clone() if exchanged else batch[key]
+        for position in exchanged:
+            images[position] = normalise(key, self.image(int(rows[position]), key)).to(images)
+        return images
 
     # ---- single frames ----
 
     def image(self, row: int, key: str) -> Tensor:
         """A camera's frame (C, H, W) in [0, 1], read from its dataset."""
-        start, dataset = next(source for source in reversed(self._sources) if source[0] <= row)
+        start, dataset = self._source(row)
         return dataset[row - start][key]
 
-    def history(self, rows: Tensor, keys: Sequence[str], n_obs_steps: int) -> dict[str, Tensor]:
-        """Raw observation histories (B, n_obs_steps, ...) of rows, for a teacher."""
+    def task(self, row: int) -> str:
+        """What the episode of a row is about, as its dataset describes it."""
+        start, _ = self._source(row)
+        return self._tasks[start][row - start]
+
+    def _source(self, row: int) -> tuple[int, LeRobotDataset]:
+        """The dataset that holds a row, and the row's number at which it starts."""
+        return next(source for source in reversed(self._sources) if source[0] <= row)
+
+    def history(self, rows: Tensor, keys: Sequence[str], n_obs_steps: int) -> Batch:
+        """Raw observation histories (B, n_obs_steps, ...) of rows, for a teacher; with the rows' `task`s."""
         raw, offsets = self.raw, torch.arange(1 - n_obs_steps, 1)
         rows = rows.cpu()
-        histories = {}
+        histories: Batch = {"task": [self.task(row) for row in rows.tolist()]}
         for key in keys:
             if key in raw.columns:
                 histories[key] = raw.gather(key, rows, offsets)[0]
@@ -171,3 +191,9 @@ class Replay:
     def vector_keys(self) -> list[str]:
         """Low-dimensional observation features."""
         return [key for key in self.memory.keys if key != ACTION]
+
+
+def _tasks(dataset: LeRobotDataset) -> list[str]:
+    """The task of every frame."""
+    names = {int(index): str(name) for name, index in dataset.meta.tasks["task_index"].items()}
+    return [names[int(index)] for index in dataset.hf_dataset.with_format("numpy")["task_index"][:]]

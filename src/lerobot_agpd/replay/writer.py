@@ -81,6 +81,7 @@ class EpisodeWriter:
         n_steps = len(episode)
         done = np.zeros((n_steps, 1), dtype=bool)
         done[-1] = True
+        teacher_alone = not episode.ticket.guided and episode.student_steps == 0
         columns: dict[str, Any] = {
             **episode.observations,
             ACTION: episode.actions,
@@ -88,7 +89,7 @@ class EpisodeWriter:
             DONE: done,
             "agpd.round": np.full((n_steps, 1), number, dtype=np.int64),
             "agpd.scale": np.full((n_steps, 1), episode.ticket.scale, dtype=np.float32),
-            "agpd.strategy": [strategy if episode.ticket.guided else "replay"] * n_steps,
+            "agpd.strategy": ["replay" if teacher_alone else strategy] * n_steps,
         }
         if episode.successes is not None:
             columns[SUCCESS] = episode.successes[:, None]

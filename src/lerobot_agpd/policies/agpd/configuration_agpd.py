@@ -2,34 +2,29 @@
 
 from __future__ import annotations
 
-import json
-from copy import deepcopy
 from dataclasses import dataclass, field
-from pathlib import Path
 
-import draccus
-from huggingface_hub.constants import CONFIG_NAME
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import DiffuserSchedulerConfig
 from lerobot.policies.act.configuration_act import ACTConfig
 
-from lerobot_agpd.collect.config import CollectConfig
-from lerobot_agpd.distill.config import AdversaryConfig
-from lerobot_agpd.guidance.config import GuidanceConfig, RepresentationConfig, TeacherConfig
-from lerobot_agpd.replay.config import ReplayConfig
+from lerobot_agpd.distill.config import DistilledConfig
 
 
 @PreTrainedConfig.register_subclass("agpd")
 @dataclass
-class AGPDConfig(ACTConfig):
+class AGPDConfig(DistilledConfig, ACTConfig):
     """LeRobot's ACT with the groups of the distillation; all of ACT's fields keep their meaning and defaults."""
 
-    teacher: TeacherConfig = field(default_factory=TeacherConfig)
-    guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
-    collect: CollectConfig = field(default_factory=CollectConfig)
-    replay: ReplayConfig = field(default_factory=ReplayConfig)
-    adversary: AdversaryConfig = field(default_factory=AdversaryConfig)
-    representation: RepresentationConfig = field(default_factory=RepresentationConfig)
+    # As LeRobot's, and observation.environment_state too, which LeRobot's ACT takes as it is.
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "VISUAL": NormalizationMode.MEAN_STD,
+            "STATE": NormalizationMode.MEAN_STD,
+            "ENV": NormalizationMode.MEAN_STD,
+            "ACTION": NormalizationMode.MEAN_STD,
+        }
+    )
     scheduler_name: str | None = (
         None  # learning rate schedule, e.g. cosine; default: constant, as LeRobot trains ACT
     )
@@ -55,10 +50,12 @@ class AGPDConfig(ACTConfig):
         """None: the loader delivers single frames, chunks are cut from memory."""
         return None
 
-    def _save_pretrained(self, save_directory: Path) -> None:
-        # The environment stays out of config.json: a checkpoint must load where its type is not registered.
-        # The run's train_config.json has it.
-        config = deepcopy(self)
-        config.collect.env = None
-        with open(save_directory / CONFIG_NAME, "w") as file:
-            json.dump(draccus.encode(config, PreTrainedConfig), file, indent=4)
+    @property
+    def chunk_offsets(self) -> list[int]:
+        """Steps of a chunk relative to the current one."""
+        return list(range(self.chunk_size))
+
+    @property
+    def observation_history(self) -> None:
+        """None: ACT looks at the current observation alone, without a time dimension."""
+        return None

@@ -1,20 +1,25 @@
 """LeRobot's diffusion policy with another denoiser, averaged weights and rows cut from memory."""
 
 import logging
+import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import torch
 from diffusers.training_utils import EMAModel
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.diffusion.modeling_diffusion import DiffusionModel, DiffusionPolicy
+from lerobot.utils.constants import ACTION
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
     DiffusionTransformerConfig,
 )
-from lerobot_agpd.policies.diffusion_transformer.denoisers import MLPDenoiser
+from lerobot_agpd.policies.diffusion_transformer.model import DenoisingModel
+from lerobot_agpd.policies.diffusion_transformer.transformer import weight_decay_groups
 from lerobot_agpd.replay.memory import FrameMemory, delivers_single_frames, gather_rows
 from lerobot_agpd.replay.normalisation import Statistics
 from lerobot_agpd.run import this_run
@@ -27,7 +32,7 @@ RAW_WEIGHTS = "raw_weights.safetensors"
 
 
 class DiffusionTransformerPolicy(DiffusionPolicy):
-    """Diffusion policy (arXiv:2303.04137) whose denoiser is a plug-in.
+    """Diffusion policy (arXiv:2303.04137) with an MLP, a transformer or LeRobot's U-Net as its denoiser.
 
     The averaged (EMA) weights are the policy's weights everywhere but in training mode: `eval()` swaps them
     in, `train()` swaps them out, and `save_pretrained` writes them to model.safetensors, so that evaluation,
@@ -36,6 +41,8 @@ class DiffusionTransformerPolicy(DiffusionPolicy):
 
     config_class = DiffusionTransformerConfig
     name = "diffusion_transformer"
+    model_class: type[DiffusionModel] = DenoisingModel
+    optional_weights: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -45,20 +52,26 @@ class DiffusionTransformerPolicy(DiffusionPolicy):
         **kwargs: Any,
     ):
         """Build the policy; with `dataset_meta` its frames are loaded into memory at the first training step."""
-        super().__init__(config, **kwargs)
+        # Not DiffusionPolicy's constructor: it would build a second model, only to be thrown away.
+        PreTrainedPolicy.__init__(self, config)
+        config.validate_features()
         self.config: DiffusionTransformerConfig = config
-        denoiser: Any = make_denoiser(config, self.diffusion)
-        if config.compile_model:
-            denoiser = torch.compile(denoiser, mode=config.compile_mode)
-        self.diffusion.unet = denoiser
+        self.diffusion = self.model_class(config)
+        self.reset()
         self._dataset = (dataset_meta, dataset_stats)
         self._memory: FrameMemory | None = None
         self._ema: EMAModel | None = None
         self._ema_is_active = False
 
+    def get_optim_params(self) -> Iterable[Tensor] | list[dict[str, Any]]:
+        """Parameters for the optimizer; with a transformer, weight decay is for its matrices alone."""
+        if self.config.denoiser == "transformer":
+            return weight_decay_groups(self.diffusion)
+        return self.diffusion.parameters()
+
     # ---- training ----
 
-    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, None]:
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any] | None]:
         """Noise prediction loss on a batch of single frames (`index`) or of LeRobot's own chunks."""
         if delivers_single_frames(batch):
             batch = self._gather(batch)
@@ -66,7 +79,8 @@ class DiffusionTransformerPolicy(DiffusionPolicy):
             self._ema = self._make_ema()  # before the first step: resuming exchanges the weights here
         if self.training and self.config.noise_samples_per_frame > 1:
             repeats = self.config.noise_samples_per_frame
-            batch = {k: v.repeat_interleave(repeats, 0) for k, v in batch.items() if isinstance(v, Tensor)}
+            targets = {k: batch[k].repeat_interleave(repeats, 0) for k in (ACTION, "action_is_pad")}
+            batch = {**batch, **targets}  # the model encodes an observation once for all its targets
         return super().forward(batch)
 
     def _gather(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -91,6 +105,16 @@ class DiffusionTransformerPolicy(DiffusionPolicy):
     # ---- averaged weights ----
 
     def _make_ema(self) -> EMAModel:
+        if os.environ.get("ACCELERATE_USE_FSDP", "false").lower() == "true":
+            raise RuntimeError(
+                "averaged weights need whole parameters on every process, but the run shards them (FSDP): train "
+                "with DDP, or pass --policy.ema.enable=false"
+            )
+        if any(isinstance(module, nn.modules.batchnorm._BatchNorm) for module in self.diffusion.modules()):
+            logger.warning(
+                "batch normalisation's running statistics are not averaged with the weights; consider "
+                "--policy.use_group_norm=true --policy.pretrained_backbone_weights=null"
+            )
         ema = EMAModel(
             self.diffusion.parameters(),
             decay=self.config.ema.max_decay,
@@ -128,7 +152,7 @@ class DiffusionTransformerPolicy(DiffusionPolicy):
 
     @classmethod
     def _load_as_safetensor(cls, model: Any, model_file: str, map_location: str, strict: bool) -> Any:
-        require_weights(model, model_file)
+        require_weights(model, model_file, optional=cls.optional_weights)
         return super()._load_as_safetensor(model, model_file, map_location, strict)
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
@@ -139,30 +163,7 @@ class DiffusionTransformerPolicy(DiffusionPolicy):
             raw["ema_steps"] = torch.tensor(self._ema.optimization_step)
             save_file(raw, save_directory / RAW_WEIGHTS)
         self._activate_ema(True)
+        if self._ema is not None and state_dict is not None:  # gathered by the caller: raw weights
+            state_dict = {**state_dict, **self.state_dict()}
         super()._save_pretrained(save_directory, state_dict=state_dict)
         self._activate_ema(was_active)
-
-
-def make_denoiser(config: DiffusionTransformerConfig, model: DiffusionModel) -> MLPDenoiser:
-    """The denoiser that `config` names, sized for the condition of LeRobot's diffusion model."""
-    if config.robot_state_feature is None or config.action_feature is None:
-        raise ValueError(
-            "a diffusion policy needs the features observation.state and action, got "
-            f"{list(config.input_features or {})} and {list(config.output_features or {})}"
-        )
-    per_step = config.robot_state_feature.shape[0]
-    if config.env_state_feature is not None:
-        per_step += config.env_state_feature.shape[0]
-    if config.image_features:
-        encoder: Any = model.rgb_encoder
-        if isinstance(encoder, nn.ModuleList):
-            encoder = encoder[0]
-        per_step += encoder.feature_dim * len(config.image_features)
-    return MLPDenoiser(
-        horizon=config.horizon,
-        action_dim=config.action_feature.shape[0],
-        cond_dim=per_step * config.n_obs_steps,
-        width=config.mlp.width,
-        n_blocks=config.mlp.n_blocks,
-        time_embed_dim=config.mlp.time_embed_dim,
-    )

@@ -1,0 +1,1 @@
+"""A fair comparison: tasks x methods x training seeds from one YAML, run, evaluated and reported."""

@@ -1,0 +1,209 @@
+"""`lerobot-agpd-compare`: train, evaluate and compare methods over tasks and seeds, from one YAML; resumable."""
+
+import logging
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import draccus
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.utils import init_logging
+from rich.console import Console
+from rich.markdown import Markdown
+
+from lerobot_agpd.analysis.comparison.curves import draw_curves
+from lerobot_agpd.analysis.comparison.evaluations import evaluate_run
+from lerobot_agpd.analysis.comparison.files import write_text
+from lerobot_agpd.analysis.comparison.jobs import Job, Step, run_jobs
+from lerobot_agpd.analysis.comparison.matrix import Matrix, load_matrix
+from lerobot_agpd.analysis.comparison.results import RunResult, read_result
+from lerobot_agpd.analysis.comparison.runs import Run, check, expand
+from lerobot_agpd.analysis.comparison.table import report
+from lerobot_agpd.analysis.comparison.training import (
+    TRAIN_LOG,
+    StartLog,
+    check_same_command,
+    executable,
+    prepare,
+    progress,
+    replay_parent,
+    train_command,
+)
+from lerobot_agpd.cli.report import collected
+from lerobot_agpd.guidance.config import require
+
+logger = logging.getLogger(__name__)
+
+PHASES = ("all", "train", "evaluate", "report")
+EVALUATE_LOG = "evaluate.log"
+REPORT = "report.md"
+
+
+@dataclass
+class CompareConfig:
+    """Options of `lerobot-agpd-compare`."""
+
+    matrix: Path  # YAML of the comparison, see benchmarks/comparison
+    output: Path | None = None  # folder of runs and report; default: the matrix's
+    only: str = "all"  # all, train, evaluate or report; a single run is evaluated in this process
+    tasks: list[str] = field(default_factory=list)  # part of the matrix's tasks; default: all
+    methods: list[str] = field(default_factory=list)  # part of its methods; default: all
+    seeds: list[int] = field(default_factory=list)  # part of its training seeds; default: all
+    jobs: int = 1  # runs at a time
+    threads: int = 1  # OMP_NUM_THREADS of each
+    dry_run: bool = False  # print the commands and stop
+
+    def __post_init__(self) -> None:
+        require(self.only in PHASES, f"--only must be one of {list(PHASES)}, got '{self.only}'")
+        for name in ("jobs", "threads"):
+            require(getattr(self, name) >= 1, f"--{name} must be at least 1, got {getattr(self, name)}")
+
+
+def load(config: CompareConfig) -> tuple[Matrix, list[Run]]:
+    """The matrix and the chosen runs, checked as far as that is possible before anything starts."""
+    matrix = load_matrix(config.matrix)
+    if config.output is not None:
+        matrix.output = config.output
+    runs = expand(matrix, config.tasks, config.methods, config.seeds)
+    if config.only != "report":
+        check(matrix, runs)
+        for run in runs:
+            check_same_command(run)
+    return matrix, runs
+
+
+# ---- running ----
+
+
+def job(config: CompareConfig, matrix: Matrix, run: Run) -> Job:
+    """Train (or resume) a run, then evaluate it."""
+    steps = []
+    if config.only != "evaluate" and not run.policy:
+        steps.append(training_step(run, config.threads))
+    if config.only != "train":
+        words = executable(evaluate_command(config, matrix, run))
+        steps.append(Step(lambda: words, run.folder / EVALUATE_LOG))
+    return Job(run.name, run.folder, steps)
+
+
+def training_step(run: Run, threads: int) -> Step:
+    """The lerobot-train command of a run, noted in its log of starts."""
+    starts: list[StartLog] = []
+
+    def command() -> Sequence[str] | None:
+        reached = progress(run)
+        if reached is not None and reached.finished:
+            return None
+        prepare(run)
+        words = train_command(run)
+        starts.append(StartLog(run))
+        starts[0].begin(run, words, threads)
+        return executable(words)
+
+    return Step(command, run.folder / TRAIN_LOG, lambda returncode: starts[0].end(returncode))
+
+
+def evaluate_command(config: CompareConfig, matrix: Matrix, run: Run) -> list[str]:
+    """The command that evaluates one run."""
+    words = [f"--matrix={config.matrix}", f"--output={matrix.output}", "--only=evaluate"]
+    words += [f"--tasks=[{run.task}]", f"--methods=[{run.method}]"]
+    if run.seed is not None:
+        words.append(f"--seeds=[{run.seed}]")
+    return ["lerobot-agpd-compare", *words]
+
+
+def needs_work(config: CompareConfig, matrix: Matrix, run: Run) -> bool:
+    """Whether a run still has to be trained or evaluated."""
+    if config.only == "train":
+        reached = progress(run)
+        return not run.policy and not (reached is not None and reached.finished)
+    try:
+        return read_result(run, matrix) is None
+    except ValueError as error:
+        logger.warning("making the result again: %s", error)
+        return True
+
+
+def show_commands(config: CompareConfig, matrix: Matrix, runs: Sequence[Run], console: Console) -> None:
+    """Print what would be run."""
+    for run in runs:
+        reached = progress(run)
+        state = f"at step {reached.step} of {reached.steps}" if reached else "not begun"
+        state = "evaluated only" if run.policy else state
+        state = state if needs_work(config, matrix, run) else "finished"
+        lines = [f"# {run.name}: {state}"]
+        if not run.policy and not (reached and reached.finished):
+            lines.append(shlex.join(train_command(run)))
+        lines.append(shlex.join(evaluate_command(config, matrix, run)))
+        console.print("\n".join(lines) + "\n", markup=False, highlight=False, soft_wrap=True)
+
+
+# ---- reporting ----
+
+
+def write_report(matrix: Matrix, runs: Sequence[Run]) -> str:
+    """Write report.md and one picture of learning curves per task; returns the report.
+
+    Raises:
+        ValueError: if no run has a result, or one is damaged.
+    """
+    found: dict[str, dict[str, list[RunResult]]] = {}
+    missing = []
+    for run in runs:
+        result = read_result(run, matrix)
+        if result is None:
+            missing.append(run.name)
+        else:
+            found.setdefault(run.task, {}).setdefault(run.method, []).append(result)
+    require(bool(found), f"{matrix.output} holds no result of this comparison yet")
+    order = list(matrix.methods)
+    found = {
+        task: {name: methods[name] for name in order if name in methods} for task, methods in found.items()
+    }
+    text = report(matrix, found, missing)
+    write_text(matrix.output / REPORT, text)
+    for task, methods in found.items():
+        entry = matrix.tasks[task]
+        draw_curves(methods, entry.measure, entry.title or task, matrix.output / f"curves-{task}.png")
+    return text
+
+
+@draccus.wrap()
+def run(config: CompareConfig) -> None:
+    """Check, run what is missing, report."""
+    console = Console()
+    matrix, runs = load(config)
+    if config.dry_run:
+        show_commands(config, matrix, runs, console)
+        return
+    failures: dict[str, str] = {}
+    if config.only == "evaluate" and len(runs) == 1:
+        evaluate_run(matrix, runs[0], collected(replay_parent(runs[0])))
+        return
+    if config.only != "report":
+        waiting = [entry for entry in runs if needs_work(config, matrix, entry)]
+        logger.info("%d runs, %d of them finished", len(runs), len(runs) - len(waiting))
+        jobs = [job(config, matrix, entry) for entry in waiting]
+        failures = run_jobs(jobs, config.jobs, config.threads, console)
+    if config.only != "train" and len(failures) < len(runs):
+        console.print(Markdown(write_report(matrix, runs)))
+        logger.info("wrote %s and curves-*.png to %s", REPORT, matrix.output)
+    if failures:
+        logger.error("%d runs failed: %s; run the same command to go on", len(failures), ", ".join(failures))
+        sys.exit(1)
+
+
+def main() -> None:
+    """Console entry point."""
+    init_logging()
+    register_third_party_plugins()
+    try:
+        run()
+    except (ValueError, FileNotFoundError) as error:
+        sys.exit(f"lerobot-agpd-compare: {error}")
+
+
+if __name__ == "__main__":
+    main()

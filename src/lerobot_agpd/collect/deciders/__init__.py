@@ -1,0 +1,1 @@
+"""The collection strategies, one file each."""

@@ -1,0 +1,161 @@
+"""LeRobot environment type `aloha_state`: ALOHA's simulated tasks with object poses instead of images.
+
+The raw keys become `observation.state`, `observation.environment_state` and `observation.images.<camera>`. The
+simulation is in `aloha_sim`.
+"""
+
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.vector import VectorEnv
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs.configs import AlohaEnv as LeRobotAlohaEnv, EnvConfig
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
+
+from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS, check_image_size, make_vector_env
+
+FPS = 50
+CAMERAS = ("top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist")
+ALOHA_TASKS: dict[str, tuple[str, int]] = {
+    "AlohaTransferCube-v0": ("transfer_cube", 1),
+    "AlohaInsertion-v0": ("insertion", 2),
+}
+"""LeRobot's task to gym_aloha's name and its number of objects."""
+
+OBSERVED_KEYS: dict[str, tuple[str, ...]] = {
+    "environment_state_agent_pos": (AGENT_POS, ENVIRONMENT_STATE),
+    "pixels_agent_pos": (AGENT_POS, PIXELS),
+    "pixels": (PIXELS,),
+    "pixels_environment_state_agent_pos": (AGENT_POS, ENVIRONMENT_STATE, PIXELS),
+}
+"""Raw keys of every `--env.obs_type`."""
+
+
+def _require_gym_aloha() -> None:
+    """Import gym_aloha.
+
+    Raises:
+        ModuleNotFoundError: if it or something that it needs is not installed.
+    """
+    try:
+        import gym_aloha  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            f"The aloha_state environments need the package {error.name!r}, which is not installed. "
+            "Run: pip install 'lerobot_policy_agpd[aloha]'",
+            name=error.name,
+        ) from error
+
+
+def make_single_env(task: str, episode_length: int, kwargs: dict[str, Any]) -> gym.Env:
+    """Build one environment; a worker process that has imported nothing yet can call it.
+
+    Args:
+        task: key of `ALOHA_TASKS`.
+        episode_length: steps after which an episode is truncated.
+        kwargs: for `aloha_sim.AlohaStateEnv`.
+
+    Raises:
+        ModuleNotFoundError: if gym_aloha is not installed.
+    """
+    _require_gym_aloha()
+    from lerobot_agpd.envs.aloha_sim import AlohaStateEnv
+    from lerobot_agpd.envs.workers import TASKS as DESCRIPTIONS, TaskDescription
+
+    name, _ = ALOHA_TASKS[task]
+    env = gym.wrappers.TimeLimit(AlohaStateEnv(name, **kwargs), episode_length)
+    return TaskDescription(env, DESCRIPTIONS[f"gym_aloha/{task}"])
+
+
+@EnvConfig.register_subclass("aloha_state")
+@dataclass
+class AlohaStateEnvConfig(LeRobotAlohaEnv):
+    """ALOHA's simulated tasks, seen through joints and object poses, or through cameras of any size."""
+
+    task: str | None = "AlohaTransferCube-v0"  # or AlohaInsertion-v0
+    obs_type: str = "environment_state_agent_pos"  # or pixels, pixels_agent_pos, ...
+    observation_height: int = 240  # height of observed images, pixels
+    observation_width: int = 320  # width of observed images, pixels
+    visualization_height: int = 480  # height of rendered frames, pixels
+    visualization_width: int = 640  # width of rendered frames, pixels
+    cameras: list[str] = field(default_factory=lambda: ["top"])  # observed cameras, e.g. "[top,angle]"
+    shadows: bool = True  # draw shadows; without a GPU an image is many times faster without
+
+    def __post_init__(self) -> None:
+        """Derive the features.
+
+        Raises:
+            ValueError: if an option is unknown or impossible.
+        """
+        if self.task not in ALOHA_TASKS:
+            raise ValueError(f"--env.task must be one of {', '.join(ALOHA_TASKS)}; got {self.task!r}.")
+        if self.obs_type not in OBSERVED_KEYS:
+            raise ValueError(
+                f"--env.obs_type must be one of {', '.join(OBSERVED_KEYS)}; got {self.obs_type!r}."
+            )
+        unknown = [camera for camera in self.cameras if camera not in CAMERAS]
+        if unknown or not self.cameras:
+            raise ValueError(f"--env.cameras={self.cameras} must name at least one of {', '.join(CAMERAS)}.")
+        if self.fps != FPS:
+            raise ValueError(f"{self.task} runs at {FPS} steps per second; --env.fps={self.fps} cannot be.")
+        if self.episode_length < 1:
+            raise ValueError(f"--env.episode_length must be at least 1, got {self.episode_length}.")
+        check_image_size(self.observation_height, self.observation_width)
+        keys = OBSERVED_KEYS[self.obs_type]
+        image = PolicyFeature(FeatureType.VISUAL, (self.observation_height, self.observation_width, 3))
+        self.features = {ACTION: PolicyFeature(FeatureType.ACTION, (14,))}
+        self.features_map = {ACTION: ACTION, AGENT_POS: OBS_STATE, ENVIRONMENT_STATE: OBS_ENV_STATE}
+        if AGENT_POS in keys:
+            self.features[AGENT_POS] = PolicyFeature(FeatureType.STATE, (14,))
+        if ENVIRONMENT_STATE in keys:
+            self.features[ENVIRONMENT_STATE] = PolicyFeature(
+                FeatureType.ENV, (7 * ALOHA_TASKS[self.task][1],)
+            )
+        for camera in self.cameras if PIXELS in keys else ():
+            self.features[f"{PIXELS}/{camera}"] = image
+            self.features_map[f"{PIXELS}/{camera}"] = f"{OBS_IMAGES}.{camera}"
+
+    @property
+    def package_name(self) -> str:
+        """Package that holds the simulation."""
+        return "gym_aloha"
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Keyword arguments for `aloha_sim.AlohaStateEnv`."""
+        return {
+            "keys": OBSERVED_KEYS[self.obs_type],
+            "cameras": tuple(self.cameras),
+            "shadows": self.shadows,
+            "render_mode": self.render_mode,
+            "observation_width": self.observation_width,
+            "observation_height": self.observation_height,
+            "visualization_width": self.visualization_width,
+            "visualization_height": self.visualization_height,
+        }
+
+    @property
+    def _factory(self) -> partial[gym.Env]:
+        return partial(make_single_env, str(self.task), self.episode_length, self.gym_kwargs)
+
+    def make_single(self) -> gym.Env:
+        """Build one environment outside any vector environment; see `make_single_env`."""
+        return self._factory()
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
+        """Build the vector environment; see `base.make_vector_env`.
+
+        Args:
+            n_envs: number of environments.
+            use_async_envs: one process per environment, if there are at least two.
+
+        Returns:
+            `{"aloha_state": {0: vector environment}}`.
+
+        Raises:
+            ModuleNotFoundError: if gym_aloha is not installed.
+        """
+        _require_gym_aloha()
+        return {self.type: {0: make_vector_env(self._factory, n_envs, use_async_envs)}}

@@ -1,0 +1,54 @@
+"""What the environment types share: raw observation keys and the vector environment."""
+
+from collections.abc import Callable
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+
+AGENT_POS = "agent_pos"
+ENVIRONMENT_STATE = "environment_state"
+PIXELS = "pixels"
+"""Raw keys that LeRobot's `preprocess_observation` turns into its own."""
+
+
+def unbounded(dim: int) -> gym.spaces.Box:
+    """Space of float32 vectors (dim,) without bounds."""
+    return gym.spaces.Box(-np.inf, np.inf, shape=(dim,), dtype=np.float32)
+
+
+def image_space(height: int, width: int) -> gym.spaces.Box:
+    """Space of uint8 images (height, width, 3)."""
+    return gym.spaces.Box(0, 255, shape=(height, width, 3), dtype=np.uint8)
+
+
+def check_image_size(height: int, width: int) -> None:
+    """Check an observed image's size against what LeRobot can tell from channels.
+
+    Raises:
+        ValueError: if a side has fewer than 4 pixels.
+    """
+    if min(height, width) < 4:
+        raise ValueError(
+            f"--env.observation_height={height} and --env.observation_width={width} must be at least 4 pixels."
+        )
+
+
+def make_vector_env(factory: Callable[[], gym.Env], n_envs: int, use_async_envs: bool) -> VectorEnv:
+    """Build a vector environment as LeRobot's `EnvConfig.create_envs` does, from a factory.
+
+    LeRobot's own factory runs `gymnasium.make` alone and fails in forkserver workers, where nothing has imported the
+    package that registers the id.
+
+    Args:
+        factory: builds one environment; a process that has imported nothing yet must be able to call it.
+        n_envs: number of environments.
+        use_async_envs: one process per environment, if there are at least two.
+
+    Returns:
+        The vector environment, autoreset in the same step.
+    """
+    factories = [factory] * n_envs
+    if use_async_envs and n_envs > 1:
+        return AsyncVectorEnv(factories, context="forkserver", autoreset_mode=AutoresetMode.SAME_STEP)
+    return SyncVectorEnv(factories, autoreset_mode=AutoresetMode.SAME_STEP)

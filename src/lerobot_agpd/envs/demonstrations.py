@@ -1,0 +1,98 @@
+"""Episodes of a scripted expert as dataset frames, and the count of what happened to the attempts."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from lerobot.utils.constants import ACTION, DONE, REWARD, SUCCESS
+from rich.table import Table
+
+from lerobot_agpd.envs.experts import Expert
+
+Frame = dict[str, Any]
+
+
+@dataclass
+class DemosReport:
+    """What happened to the attempts; written to `meta/demos.json` in the dataset.
+
+    Attributes:
+        task: the environment's task.
+        seeds: environment seed of every recorded episode, in order.
+        trivial_seeds: seeds skipped because the goal was reached before the first step.
+        failed_seeds: seeds whose goal was not reached at the last step.
+        skills: skill of every recorded episode, in order.
+        failed_skills: skill of every failed one.
+        frames: recorded frames.
+    """
+
+    task: str
+    seeds: list[int] = field(default_factory=list)
+    trivial_seeds: list[int] = field(default_factory=list)
+    failed_seeds: list[int] = field(default_factory=list)
+    skills: list[float] = field(default_factory=list)
+    failed_skills: list[float] = field(default_factory=list)
+    frames: int = 0
+
+    @property
+    def attempts(self) -> int:
+        """Episodes begun, those with a trivial start included."""
+        return len(self.seeds) + len(self.trivial_seeds) + len(self.failed_seeds)
+
+    @property
+    def success_rate(self) -> float:
+        """Share of episodes with the goal reached at the last step, without trivial starts; nan if there are none."""
+        played = len(self.seeds) + len(self.failed_seeds)
+        return len(self.seeds) / played if played else float("nan")
+
+    def success_rate_of(self, skill: float) -> float:
+        """Share of an operator's episodes, without trivial starts, with the goal reached at the last step."""
+        succeeded, failed = self.skills.count(skill), self.failed_skills.count(skill)
+        return succeeded / (succeeded + failed) if succeeded + failed else float("nan")
+
+    def to_table(self) -> Table:
+        """Lay the counts out for the console."""
+        table = Table("scripted expert", self.task)
+        table.add_row("attempts", str(self.attempts))
+        table.add_row("skipped: goal reached at the start", str(len(self.trivial_seeds)))
+        table.add_row("dropped: failed", str(len(self.failed_seeds)))
+        table.add_row("recorded episodes", str(len(self.seeds)))
+        table.add_row("recorded frames", str(self.frames))
+        table.add_row("success rate without trivial starts", f"{self.success_rate:.3f}")
+        operators = sorted({*self.skills, *self.failed_skills}, reverse=True)
+        if operators != [1.0]:
+            for skill in operators:
+                counts = f"{self.skills.count(skill)} recorded, {self.failed_skills.count(skill)} failed"
+                table.add_row(f"  skill {skill:g}", f"{self.success_rate_of(skill):.3f} ({counts})")
+        return table
+
+
+def play_episode(env: gym.Env, expert: Expert, seed: int, features_map: dict[str, str]) -> list[Frame] | None:
+    """Let the expert play one episode to its end.
+
+    Args:
+        env: a single environment with LeRobot's raw keys, and with the attribute `state` for the expert.
+        expert: maps a raw state observation to an action.
+        seed: environment seed of the reset.
+        features_map: raw key to dataset key.
+
+    Returns:
+        One dataset frame per step, or None if the goal is reached before the first step.
+    """
+    observation, info = env.reset(seed=seed)
+    if info["is_success"]:
+        return None
+    frames: list[Frame] = []
+    done = False
+    while not done:
+        action = expert(env.get_wrapper_attr("state"))
+        frame = {features_map[key]: value for key, value in observation.items()}
+        observation, reward, terminated, truncated, info = env.step(action)
+        done = terminated or truncated
+        frame[ACTION] = action
+        frame[REWARD] = np.array([reward], dtype=np.float32)
+        frame[SUCCESS] = np.array([info["is_success"]], dtype=bool)
+        frame[DONE] = np.array([done], dtype=bool)
+        frames.append(frame)
+    return frames

@@ -1,0 +1,128 @@
+"""Operators of limited skill: a scripted expert that hesitates, trembles, takes detours, makes mistakes and recovers.
+
+What an operator *intends* stays a pure function of the observation: the expert's action, slower and on a bent path.
+What chance adds on top (tremor, pauses, slips) is noise that no observation shows, as with people. A mistake is never
+a plan: after a slip of a few steps the expert sees where things are now and carries on from there.
+
+Human data mix operators in the same way; the multi-human sets of robomimic (arXiv:2108.03298) are the model for a list
+of skills.
+"""
+
+import math
+
+import numpy as np
+
+from lerobot_agpd.envs.experts import Array, Expert
+
+# All of these are reached at skill 0 and fall linearly to nothing at skill 1.
+SLOWNESS = 0.3  # share of the speed that is lost
+DETOUR_ANGLE = math.radians(60)  # largest turn of the horizontal heading
+DETOUR_WAVELENGTH = 0.20  # metres of hand travel after which the turn repeats
+TREMOR = 0.3  # standard deviation of the noise on the motion, action units
+PAUSE_RATE = 0.05  # pauses begun per step
+SLIP_RATE = 0.04  # slips begun per step
+
+TREMOR_CORRELATION = 0.7  # from one step to the next
+PAUSE_STEPS = (2, 6)  # shortest and longest
+SLIP_STEPS = (2, 5)
+
+
+def bent_path(action: Array, hand: Array, skill: float) -> Array:
+    """Slow an action down and turn its horizontal heading by an angle that depends on where the hand is.
+
+    The angle stays below 90 degrees: every step still gets closer to where the expert wanted to go.
+
+    Args:
+        action: (4,) displacement x, y, z and gripper, action units.
+        hand: (3,) position of the hand, metres.
+        skill: 1 returns the action unchanged, 0 bends it most.
+
+    Returns:
+        (4,) action.
+    """
+    lapse = 1.0 - skill
+    phase = 2 * math.pi * (hand[0] + hand[1]) / DETOUR_WAVELENGTH
+    turn = lapse * DETOUR_ANGLE * math.sin(phase)
+    x, y = action[:2]
+    turned = np.array(
+        [
+            math.cos(turn) * x - math.sin(turn) * y,
+            math.sin(turn) * x + math.cos(turn) * y,
+            action[2],
+        ]
+    )
+    return np.append((1.0 - SLOWNESS * lapse) * turned, action[3])
+
+
+class Operator:
+    """An expert played with some skill, for one episode.
+
+    At skill 1 it is the expert, bit for bit, and draws no random number.
+    """
+
+    def __init__(self, expert: Expert, skill: float, rng: np.random.Generator) -> None:
+        """Begin an episode.
+
+        Args:
+            expert: pure function from an observation to an action (4,) in [-1, 1]: x, y, z, gripper.
+            skill: in [0, 1].
+            rng: source of tremor, pauses and slips.
+
+        Raises:
+            ValueError: if the skill is outside [0, 1].
+        """
+        if not 0.0 <= skill <= 1.0:
+            raise ValueError(f"A skill lies in [0, 1], got {skill}.")
+        self.expert = expert
+        self.skill = skill
+        self._rng = rng
+        self._tremor: Array = np.zeros(3)
+        self._pause_left = 0
+        self._slip_left = 0
+        self._slip_action: Array = np.zeros(4)
+
+    def __call__(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        """Act on one raw observation of a single environment.
+
+        Args:
+            observation: `agent_pos`, whose first three numbers are the hand's position, and `environment_state`.
+
+        Returns:
+            Action (4,) in [-1, 1], float32.
+        """
+        wanted = self.expert(observation)
+        if self.skill == 1.0:
+            return wanted
+        hand = np.asarray(observation["agent_pos"][:3], dtype=np.float64)
+        action = bent_path(np.asarray(wanted, dtype=np.float64), hand, self.skill)
+        action = self._slip(self._pause(action))
+        action[:3] += self._next_tremor()
+        return np.clip(action, -1.0, 1.0).astype(np.float32)
+
+    def _next_tremor(self) -> Array:
+        """First-order autoregressive noise with a stationary standard deviation of `TREMOR` times the lapse."""
+        innovation = math.sqrt(1.0 - TREMOR_CORRELATION**2) * (1.0 - self.skill) * TREMOR
+        self._tremor = TREMOR_CORRELATION * self._tremor + innovation * self._rng.standard_normal(3)
+        return self._tremor
+
+    def _pause(self, action: Array) -> Array:
+        """Stand still for a few steps now and then; the fingers do what they did."""
+        self._pause_left = self._next_count(self._pause_left, PAUSE_RATE, PAUSE_STEPS)
+        return np.append(np.zeros(3), action[3]) if self._pause_left else action
+
+    def _slip(self, action: Array) -> Array:
+        """Move off in a random direction for a few steps now and then, the gripper doing the opposite."""
+        before = self._slip_left
+        self._slip_left = self._next_count(self._slip_left, SLIP_RATE, SLIP_STEPS)
+        if self._slip_left > before:  # a new one
+            direction = self._rng.standard_normal(3)
+            self._slip_action = np.append(direction / np.linalg.norm(direction), -action[3])
+        return self._slip_action.copy() if self._slip_left else action
+
+    def _next_count(self, left: int, rate: float, steps: tuple[int, int]) -> int:
+        """Steps left of a pause or slip: count down, or begin one with probability `rate` times the lapse."""
+        if left > 1:
+            return left - 1
+        if self._rng.random() < (1.0 - self.skill) * rate:
+            return int(self._rng.integers(steps[0], steps[1] + 1))
+        return 0

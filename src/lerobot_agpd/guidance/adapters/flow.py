@@ -1,0 +1,80 @@
+"""LeRobot's multi-task diffusion transformer as a teacher: flow matching, or diffusion."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_agpd.guidance.adapters.diffusion import set_diffusion_sampler, stack_cameras
+from lerobot_agpd.guidance.config import GUIDANCE_POINTS
+from lerobot_agpd.guidance.flow import guided_velocity
+from lerobot_agpd.guidance.guide import Guide, guided
+from lerobot_agpd.guidance.teacher import Teacher, seeded_by
+
+
+class MultiTaskDiTTeacher(Teacher):
+    """A MultiTaskDiTPolicy (arXiv:2507.05331), guided as its objective denoises.
+
+    With `objective=diffusion` the scheduler's steps are shifted as for a diffusion policy, with
+    `objective=flow_matching` the velocity is. Its chunk starts n_obs_steps - 1 steps in the past.
+    """
+
+    can_be_guided = True
+
+    @property
+    def start(self) -> int:
+        """Index of the current step in its internal chunk."""
+        return self.n_obs_steps - 1
+
+    @property
+    def n_chunk_steps(self) -> int:
+        """Steps of a chunk from the current one on."""
+        return self.policy.config.horizon - self.start
+
+    @property
+    def resizes_images(self) -> bool:
+        """Whether it accepts images of any size."""
+        return self.policy.config.image_resize_shape is not None
+
+    @property
+    def guidance_points(self) -> tuple[str, ...]:
+        """Where J can be differentiated: a flow has no posterior mean."""
+        return ("x0",) if self.policy.config.is_flow_matching else GUIDANCE_POINTS
+
+    def set_sampler(self, num_inference_steps: int | None, noise_scheduler: str | None) -> None:
+        """Exchange the number of steps, and for diffusion the scheduler."""
+        if self.policy.config.is_diffusion:
+            set_diffusion_sampler(self.policy.objective, num_inference_steps, noise_scheduler)
+            return
+        if noise_scheduler is not None:
+            raise self.no_such_setting("noise_scheduler", noise_scheduler, "integrates a flow")
+        if num_inference_steps is not None:
+            self.policy.config.num_integration_steps = num_inference_steps
+
+    def _sample_chunk(
+        self, batch: dict[str, Any], guide: Guide | None, generator: torch.Generator | None
+    ) -> Tensor:
+        policy = self.policy
+        condition = policy.observation_encoder.encode(stack_cameras(policy.config, batch))  # (B, C)
+        model = policy.noise_predictor
+        if guide is not None and policy.config.is_flow_matching and bool((guide.scale > 0).any()):
+            model = GuidedVelocity(model, guide)
+        diffusion_guide = guide if policy.config.is_diffusion else None
+        with seeded_by(generator), guided(policy.objective, diffusion_guide):
+            return policy.objective.conditional_sample(model, len(condition), condition)
+
+
+class GuidedVelocity(nn.Module):
+    """A velocity network under a guide; time runs from 0 (noise) to 1 (data)."""
+
+    def __init__(self, model: nn.Module, guide: Guide):
+        super().__init__()
+        self.model = model
+        self.guide = guide
+
+    def forward(self, x: Tensor, time: Tensor, **condition: Any) -> Tensor:
+        """The guided velocity, (B, H, A), of chunks (B, H, A) at times (B,), all the same."""
+        velocity = self.model(x, time, **condition)
+        return guided_velocity(self.guide, x, velocity, float(time[0]), action_dim=x.shape[-1])

@@ -1,0 +1,132 @@
+"""Flow-matching policies with LeRobot's real-time-chunking (RTC) hook as teachers: pi0, pi05, smolvla.
+
+RTC pulls a chunk toward what is left of the previous one (arXiv:2506.07339); the same hook pulls it toward the
+student. LeRobot's `euler_integrate` asks the policy's RTC processor for every velocity, with time running from
+1 (noise) to 0 (data) and velocities pointing from data to noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from lerobot.policies.rtc import RTCConfig
+from torch import Tensor
+
+from lerobot_agpd.guidance.flow import guided_velocity
+from lerobot_agpd.guidance.guide import Guide
+from lerobot_agpd.guidance.teacher import Features, Teacher
+
+EMPTY_CAMERA = "empty_camera"  # LeRobot's name for cameras that the policy fills in by itself
+
+
+class RTCTeacher(Teacher):
+    """A policy whose `predict_action_chunk` takes `noise` and whose `model` asks an RTC processor for velocities.
+
+    Actions are padded to max_action_dim inside; the padding stays unguided.
+    """
+
+    can_be_guided = True
+
+    def __init__(self, *args: Any):
+        """Refuse variants that the hook cannot guide."""
+        super().__init__(*args)
+        for flag, why in (
+            (
+                "adapt_to_pi_aloha",
+                "converts actions behind the normalised space in which chunks are compared",
+            ),
+            ("compile_model", "samples in a compiled graph, which a guide cannot enter"),
+        ):
+            if getattr(self.policy.config, flag, False):
+                raise ValueError(f"the {self.type} teacher has {flag}=true, so it {why}; it must be false")
+
+    @property
+    def n_chunk_steps(self) -> int:
+        """Steps of a chunk from the current one on."""
+        return self.policy.config.chunk_size
+
+    @property
+    def input_features(self) -> Features:
+        """Observations it needs, without the cameras that it fills in by itself."""
+        features = self.policy.config.input_features
+        return {key: feature for key, feature in features.items() if EMPTY_CAMERA not in key}
+
+    @property
+    def resizes_images(self) -> bool:
+        """Whether it accepts images of any size."""
+        return True
+
+    @property
+    def guidance_points(self) -> tuple[str, ...]:
+        """Where J can be differentiated: a flow has no posterior mean."""
+        return ("x0",)
+
+    def set_sampler(self, num_inference_steps: int | None, noise_scheduler: str | None) -> None:
+        """Exchange the number of Euler steps."""
+        if noise_scheduler is not None:
+            raise self.no_such_setting("noise_scheduler", noise_scheduler, "integrates a flow")
+        if num_inference_steps is not None:
+            config = self.policy.config
+            field = "num_steps" if hasattr(config, "num_steps") else "num_inference_steps"
+            setattr(config, field, num_inference_steps)
+
+    def _sample_chunk(
+        self, batch: dict[str, Any], guide: Guide | None, generator: torch.Generator | None
+    ) -> Tensor:
+        now = self._now(batch)
+        noise = self._noise(len(next(iter(now.values()))), generator)
+        with velocities_guided(self.policy, guide, self.action_feature.shape[0]):
+            return self.policy.predict_action_chunk(now, noise=noise)
+
+    def _noise(self, batch_size: int, generator: torch.Generator | None) -> Tensor:
+        config = self.policy.config
+        shape = (batch_size, config.chunk_size, config.max_action_dim)
+        device = None if generator is None else generator.device
+        return torch.randn(shape, generator=generator, device=device).to(config.device)
+
+
+class VelocityGuide:
+    """What LeRobot's `euler_integrate` takes for an RTC processor, guiding toward the student."""
+
+    def __init__(self, guide: Guide, action_dim: int):
+        """Guide the first `action_dim` dimensions of the padded actions."""
+        self.guide = guide
+        self.action_dim = action_dim
+
+    def denoise_step(
+        self,
+        x_t: Tensor,
+        prev_chunk_left_over: Tensor | None,
+        inference_delay: int | None,
+        time: float,
+        original_denoise_step_partial: Callable[[Tensor], Tensor],
+        execution_horizon: int | None = None,
+    ) -> Tensor:
+        """The guided velocity from data to noise, (B, H, D); the real-time arguments are not used."""
+        velocity = -original_denoise_step_partial(x_t)  # toward the data
+        return -guided_velocity(self.guide, x_t, velocity, 1 - time, self.action_dim)
+
+    def is_debug_enabled(self) -> bool:
+        """Nothing is tracked."""
+        return False
+
+    def track(self, **values: Any) -> None:
+        """Nothing is tracked; `Guide.callback` looks inside."""
+
+
+@contextmanager
+def velocities_guided(policy: Any, guide: Guide | None, action_dim: int) -> Iterator[None]:
+    """Sample from a policy under a guide; without one, or at scale 0, the policy is untouched."""
+    if guide is None or not bool((guide.scale > 0).any()):
+        yield
+        return
+    processor, config = policy.model.rtc_processor, policy.config.rtc_config
+    policy.model.rtc_processor = VelocityGuide(guide, action_dim)
+    policy.config.rtc_config = RTCConfig(enabled=True)  # the model's hook follows its configuration
+    try:
+        yield
+    finally:
+        policy.model.rtc_processor, policy.config.rtc_config = processor, config

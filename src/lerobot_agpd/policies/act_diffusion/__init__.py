@@ -1,0 +1,1 @@
+"""ACT with a diffusion prediction head (ACT-DP)."""

@@ -1,0 +1,1 @@
+"""The diffusion student trained by AGPD."""

@@ -1,0 +1,39 @@
+"""Configuration of the diffusion student trained by AGPD."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lerobot.configs import PreTrainedConfig
+
+from lerobot_agpd.distill.config import DistilledConfig
+from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
+    DiffusionTransformerConfig,
+)
+
+
+@PreTrainedConfig.register_subclass("agpd_diffusion")
+@dataclass
+class AGPDDiffusionConfig(DistilledConfig, DiffusionTransformerConfig):
+    """A diffusion policy (`denoiser` transformer: DP-T, unet: DP-C, or mlp) with the groups of the distillation.
+
+    With `teacher.path` it learns from that teacher; without, from itself (self-distillation).
+    """
+
+    def _check_memory(self) -> None:
+        """Images are allowed: T reads those from disk."""
+
+    @property
+    def observation_delta_indices(self) -> None:
+        """None: the loader delivers single frames, histories are cut from T."""
+        return None
+
+    @property
+    def action_delta_indices(self) -> None:
+        """None: the loader delivers single frames, chunks are cut from T."""
+        return None
+
+    @property
+    def observation_history(self) -> int:
+        """Steps of an observation."""
+        return self.n_obs_steps

@@ -1,0 +1,208 @@
+"""`lerobot-agpd-compare`: its job control on small commands, and a real comparison killed midway."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+from rich.console import Console
+
+from lerobot_agpd.analysis.comparison.jobs import Job, Step, activity, run_jobs
+from lerobot_agpd.cli.compare import CompareConfig
+
+ROOT = Path(__file__).parents[2]
+
+
+def python(code: str):
+    return lambda: [sys.executable, "-S", "-c", code]
+
+
+def step(tmp_path: Path, code: str, **options) -> Step:
+    return Step(python(code), tmp_path / "log", **options)
+
+
+# ---- job control ----
+
+
+def test_jobs_run_their_steps_in_order_and_report_failures(tmp_path):
+    codes = []
+    write = "import os; open('{}', 'a').write(os.environ['OMP_NUM_THREADS'])"
+    good = Job(
+        "good",
+        tmp_path / "good",
+        [
+            step(tmp_path, write.format(tmp_path / "a"), done=codes.append),
+            Step(lambda: None, tmp_path / "log"),
+            step(tmp_path, f"assert open({str(tmp_path / 'a')!r}).read() == '3'", done=codes.append),
+        ],
+    )
+    bad = Job(
+        "bad",
+        tmp_path / "bad",
+        [
+            Step(python("import sys; sys.exit('the reason')"), tmp_path / "bad.log"),
+            step(tmp_path, write.format(tmp_path / "never")),
+        ],
+    )
+    failures = run_jobs([good, bad], at_once=2, threads=3, console=Console(quiet=True))
+    assert codes == [0, 0]
+    assert list(failures) == ["bad"] and "ended with 1" in failures["bad"] and "the reason" in failures["bad"]
+    assert not (tmp_path / "never").exists()
+
+
+def test_a_folder_that_another_process_works_on_is_left_alone(tmp_path):
+    """The command that holds the lock outlives the process that started it, as after a kill -9."""
+    ready, release, again = tmp_path / "ready", tmp_path / "release", tmp_path / "again"
+    child = (
+        "import pathlib, time\n"
+        f"pathlib.Path({str(ready)!r}).touch()\n"
+        f"while not pathlib.Path({str(release)!r}).exists(): time.sleep(.05)\n"
+    )
+    parent = (
+        "import sys\nfrom pathlib import Path\nfrom rich.console import Console\n"
+        "from lerobot_agpd.analysis.comparison.jobs import Job, Step, run_jobs\n"
+        f"words = [sys.executable, '-S', '-c', {child!r}]\n"
+        f"run_jobs([Job('x', Path({str(tmp_path / 'x')!r}), [Step(lambda: words, Path({str(tmp_path / 'log')!r}))])],"
+        " 1, 1, Console(quiet=True))\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", parent])
+    wait_for(ready.exists, process)
+    process.kill()
+    process.wait()
+    job = Job("x", tmp_path / "x", [step(tmp_path, f"open({str(again)!r}, 'w')")])
+    assert "another process works on" in run_jobs([job], 1, 1, Console(quiet=True))["x"]
+    assert not again.exists()
+    release.touch()
+    wait_for(lambda: not run_jobs([job], 1, 1, Console(quiet=True)))
+    assert again.exists()
+
+
+def test_the_last_progress_bar_of_a_log(tmp_path):
+    log = tmp_path / "log"
+    assert activity(log) == ""
+    log.write_text("Training:  10%|#    | 30/300 [00:01<\rCollecting round 1:  50%|##   | 5/10 [00:01<")
+    assert activity(log) == "Collecting round 1 5/10"
+
+
+def test_wrong_options_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="--only must be one of .* got 'eval'"):
+        CompareConfig(matrix=tmp_path, only="eval")
+    with pytest.raises(ValueError, match="--jobs must be at least 1, got 0"):
+        CompareConfig(matrix=tmp_path, jobs=0)
+
+
+# ---- a real comparison ----
+
+STEPS, SAVE = 30, 10
+
+
+def tiny_matrix(folder: Path) -> Path:
+    quickstart = ROOT / "examples" / "quickstart"
+    content = {
+        "tasks": {
+            "pick": {
+                "title": "FetchPickAndPlace",
+                "env": {"type": "gymnasium_robotics", "task": "FetchPickAndPlace-v4"},
+                "dataset": {"repo_id": "local/pick", "root": str(quickstart / "demonstrations")},
+                "teacher": str(quickstart / "teacher"),
+            }
+        },
+        "methods": {
+            "bc": {"teacher": False, "flags": {"policy.collect.every": 0, "policy.adversary.weight": 0}},
+            "agpd": {},
+            "teacher": {"policy": "{teacher}"},
+        },
+        "seeds": [3],
+        "common": {
+            "config_path": str(ROOT / "examples" / "presets" / "student_cpu.yaml"),
+            "steps": STEPS,
+            "save_freq": SAVE,
+            "policy": {
+                "dim_model": 32,
+                "dim_feedforward": 64,
+                "collect": {"warmup": 12, "every": 10, "episodes": 6, "n_envs": 3},
+                "adversary.start": 5,
+            },
+        },
+        "evaluation": {"episodes": 6, "curve_episodes": 3, "batch_size": 3},
+        "output": str(folder / "comparison"),
+    }
+    path = folder / "matrix.yaml"
+    path.write_text(yaml.safe_dump(content, sort_keys=False))
+    return path
+
+
+def compare(matrix: Path, *flags: str, **options) -> subprocess.Popen:
+    words = [sys.executable, "-m", "lerobot_agpd.cli.compare", f"--matrix={matrix}", *flags]
+    env = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "MUJOCO_GL": "egl"}
+    return subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=env, **options
+    )
+
+
+def finish(process: subprocess.Popen) -> str:
+    output, _ = process.communicate(timeout=1200)
+    assert process.returncode == 0, output[-5000:]
+    return output
+
+
+def wait_for(condition, process: subprocess.Popen | None = None, seconds: float = 900) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert process is None or process.poll() is None, "ended early"
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3000)
+def test_a_killed_comparison_goes_on_where_it_was(tmp_path):
+    matrix = tiny_matrix(tmp_path)
+    output = tmp_path / "comparison" / "pick"
+    agpd = output / "agpd" / "seed-3"
+
+    first = compare(matrix, start_new_session=True)
+    wait_for((agpd / "train" / "checkpoints" / "000020").exists, first)
+    os.killpg(first.pid, signal.SIGKILL)  # as when the machine goes down, in the middle of the second run
+    first.communicate()
+    bc_weights = (
+        output / "bc" / "seed-3" / "train" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors"
+    )
+    made = {path: path.stat().st_mtime_ns for path in (bc_weights, output / "bc" / "seed-3" / "run.json")}
+    assert not (agpd / "run.json").exists()
+
+    shown = finish(compare(matrix))
+    assert "3 runs, 1 of them finished" in shown
+    assert {path: path.stat().st_mtime_ns for path in made} == made, "a finished run is not touched"
+    starts = [json.loads(line) for line in (agpd / "starts.jsonl").read_text().splitlines()]
+    assert len(starts) == 2 and starts[0]["interrupted"] and "--resume=true" in starts[1]["command"]
+    assert starts[1]["from_step"] in (SAVE, 2 * SAVE)
+
+    result = json.loads((agpd / "run.json").read_text())
+    assert list(result["curve"]) == ["10", "20", "30"]
+    assert [len(entry["successes"]) for entry in result["curve"].values()] == [3, 3, 3]
+    assert result["curve"]["10"]["seeds"] == [500_000, 500_001, 500_002]
+    assert result["last"]["step"] == STEPS and result["last"]["seeds"] == list(range(100_000, 100_006))
+    assert result["best"]["step"] in (10, 20, 30) and result["config"]["steps"] == STEPS
+    assert [entry["generated"] for entry in result["rounds"]] == [6, 6]
+    assert result["seconds"]["total"] > result["seconds"]["environment"] > 0
+    assert result["evaluated_with"]["versions"]["lerobot"]
+    text = (tmp_path / "comparison" / "report.md").read_text()
+    assert "| agpd | 30 |" in text and "| teacher | - |" in text and "Paired differences" in text
+    assert (tmp_path / "comparison" / "curves-pick.png").exists()
+
+    before = {path: path.stat().st_mtime_ns for path in output.rglob("*.json")}
+    (agpd / "run.json").write_text("{")  # half written
+    refused = compare(matrix, "--only=report")
+    printed, _ = refused.communicate(timeout=600)
+    assert refused.returncode != 0 and "run.json is damaged" in printed
+    finish(compare(matrix))
+    after = {path: path.stat().st_mtime_ns for path in output.rglob("*.json")}
+    assert [path.name for path in before if after[path] != before[path]] == ["run.json"], (
+        "only this is made again"
+    )
