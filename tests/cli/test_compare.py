@@ -12,8 +12,8 @@ import pytest
 import yaml
 from rich.console import Console
 
-from lerobot_agpd.analysis.comparison.jobs import Job, Step, activity, run_jobs
 from lerobot_agpd.cli.compare import CompareConfig
+from lerobot_agpd.comparison.jobs import Job, Step, activity, run_jobs
 
 ROOT = Path(__file__).parents[2]
 
@@ -65,7 +65,7 @@ def test_a_folder_that_another_process_works_on_is_left_alone(tmp_path):
     )
     parent = (
         "import sys\nfrom pathlib import Path\nfrom rich.console import Console\n"
-        "from lerobot_agpd.analysis.comparison.jobs import Job, Step, run_jobs\n"
+        "from lerobot_agpd.comparison.jobs import Job, Step, run_jobs\n"
         f"words = [sys.executable, '-S', '-c', {child!r}]\n"
         f"run_jobs([Job('x', Path({str(tmp_path / 'x')!r}), [Step(lambda: words, Path({str(tmp_path / 'log')!r}))])],"
         " 1, 1, Console(quiet=True))\n"

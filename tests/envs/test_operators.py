@@ -111,7 +111,6 @@ def test_impossible_skill_is_refused(skill):
         Operator(lambda observation: STILL, skill, np.random.default_rng(0))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("task", EXPERTS)
 def test_less_skill_succeeds_less_often_but_not_never(task):
     pytest.importorskip("gymnasium_robotics")
@@ -128,5 +127,6 @@ def test_less_skill_succeeds_less_often_but_not_never(task):
             outcomes.append(info["is_success"])
         return float(np.mean(outcomes))
 
-    assert success_rate(1.0) == 1.0
-    assert 0 < success_rate(0.5) <= 1.0
+    expert, poor = success_rate(1.0), success_rate(0.25)
+    assert expert == 1.0
+    assert 0 < poor < 1.0

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS
-from lerobot_agpd.envs.gymnasium_robotics import OBS_TYPES, GymnasiumRoboticsEnv
+from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
 
 pytest.importorskip("gymnasium_robotics")
-from lerobot_agpd.envs.robotics_wrapper import OBSERVED_KEYS  # noqa: E402
 
 REACH = {"task": "FetchReach-v4", "observation_height": 40, "observation_width": 64}
 
@@ -32,10 +31,6 @@ def test_no_renderer_is_opened_unless_asked_for():
     env.step(np.zeros(4, dtype=np.float32))
     assert not env.scene_renderer.is_open
     assert env.unwrapped.mujoco_renderer.viewer is None
-
-
-def test_every_kind_of_observation_is_known_to_the_wrapper():
-    assert tuple(OBSERVED_KEYS) == OBS_TYPES
 
 
 def test_images_have_the_size_asked_for(make):

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors
 from lerobot.policies import PreTrainedPolicy, get_policy_class, make_pre_post_processors
 from lerobot.scripts.lerobot_eval import eval_policy
 
-CHUNK_REPEATS = 50
+from lerobot_agpd.analysis.latency import Latency, chunk_latency
 
 
 @dataclass(frozen=True)
@@ -24,16 +22,6 @@ class Evaluation:
     successes: list[bool]
     max_rewards: list[float]
     seeds: list[int]
-
-
-@dataclass(frozen=True)
-class Latency:
-    """Time of one action chunk at batch size 1, in milliseconds, and the network's size."""
-
-    median_ms: float
-    p95_ms: float
-    n_parameters: int
-    threads: int
 
 
 class Checkpoint:
@@ -81,38 +69,9 @@ class Checkpoint:
             seeds=[int(episode["seed"]) for episode in episodes],
         )
 
-    def latency(self, repeats: int = CHUNK_REPEATS) -> Latency:
-        """Time `predict_action_chunk` on random observations."""
-        batch = {
-            key: torch.randn(1, *feature.shape, device=self.config.device)
-            for key, feature in (self.config.input_features or {}).items()
-        }
-        if self.config.n_obs_steps > 1:
-            history = self.config.n_obs_steps
-            batch = {
-                key: value[:, None].expand(-1, history, *value.shape[1:]) for key, value in batch.items()
-            }
-        times = []
-        for repeat in range(repeats + 3):  # the first ones warm up
-            self.policy.reset()
-            start = time.perf_counter()
-            self.policy.predict_action_chunk(dict(batch))
-            if torch.cuda.is_available():
-                torch.cuda.synchronize()
-            if repeat >= 3:
-                times.append(1e3 * (time.perf_counter() - start))
-        return Latency(
-            median_ms=float(np.median(times)),
-            p95_ms=float(np.quantile(times, 0.95)),
-            n_parameters=acting_parameters(self.policy),
-            threads=torch.get_num_threads(),
-        )
-
-
-def acting_parameters(policy: PreTrainedPolicy) -> int:
-    """Parameters of the acting network; a student's discriminator and representation only train."""
-    network = getattr(policy, "model", policy)
-    return sum(parameter.numel() for parameter in network.parameters())
+    def latency(self) -> Latency:
+        """Time of one chunk at batch size 1."""
+        return chunk_latency(self.policy)
 
 
 def checkpoint_steps(run: Path) -> dict[int, Path]:

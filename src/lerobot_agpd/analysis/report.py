@@ -7,7 +7,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lerobot_agpd.analysis.evaluation import Evaluation, Latency
+from lerobot_agpd.analysis.evaluation import Evaluation
+from lerobot_agpd.analysis.latency import Latency
 from lerobot_agpd.analysis.statistics import mean, success_rate
 
 

@@ -124,7 +124,7 @@ def _crossed_variance(values: np.ndarray) -> tuple[float, float]:
     ms_rest = np.sum((values - centre - rows - columns) ** 2) / rest_dof
     ms_rows = max(ms_rows, ms_rest)
     total, spread = ms_rows, ms_rows**2 / (n_rows - 1)
-    if ms_columns > ms_rest:
+    if ms_columns > ms_rest * (1 + 1e-9):  # equal but for rounding: environments explain nothing
         total += ms_columns - ms_rest
         spread += ms_columns**2 / (n_columns - 1) + ms_rest**2 / rest_dof
     return float(total / values.size), float(total**2 / spread) if spread > 0 else n_rows - 1.0

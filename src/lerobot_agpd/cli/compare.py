@@ -13,15 +13,15 @@ from lerobot.utils.utils import init_logging
 from rich.console import Console
 from rich.markdown import Markdown
 
-from lerobot_agpd.analysis.comparison.curves import draw_curves
-from lerobot_agpd.analysis.comparison.evaluations import evaluate_run
-from lerobot_agpd.analysis.comparison.files import write_text
-from lerobot_agpd.analysis.comparison.jobs import Job, Step, run_jobs
-from lerobot_agpd.analysis.comparison.matrix import Matrix, load_matrix
-from lerobot_agpd.analysis.comparison.results import RunResult, read_result
-from lerobot_agpd.analysis.comparison.runs import Run, check, expand
-from lerobot_agpd.analysis.comparison.table import report
-from lerobot_agpd.analysis.comparison.training import (
+from lerobot_agpd.comparison.curves import draw_curves
+from lerobot_agpd.comparison.evaluations import evaluate_run
+from lerobot_agpd.comparison.files import write_text
+from lerobot_agpd.comparison.jobs import Job, Step, run_jobs
+from lerobot_agpd.comparison.matrix import Matrix, load_matrix
+from lerobot_agpd.comparison.results import RunResult, read_result
+from lerobot_agpd.comparison.runs import Run, check, expand
+from lerobot_agpd.comparison.table import report
+from lerobot_agpd.comparison.training import (
     TRAIN_LOG,
     StartLog,
     check_same_command,
@@ -31,8 +31,8 @@ from lerobot_agpd.analysis.comparison.training import (
     replay_parent,
     train_command,
 )
-from lerobot_agpd.cli.report import collected
 from lerobot_agpd.guidance.config import require
+from lerobot_agpd.replay.store import ReplayStore
 
 logger = logging.getLogger(__name__)
 
@@ -180,7 +180,7 @@ def run(config: CompareConfig) -> None:
         return
     failures: dict[str, str] = {}
     if config.only == "evaluate" and len(runs) == 1:
-        evaluate_run(matrix, runs[0], collected(replay_parent(runs[0])))
+        evaluate_run(matrix, runs[0], ReplayStore(replay_parent(runs[0]) / "agpd").reports())
         return
     if config.only != "report":
         waiting = [entry for entry in runs if needs_work(config, matrix, entry)]

@@ -46,12 +46,6 @@ class ReportConfig:
                 raise FileNotFoundError(f"'{name}': {path} does not exist")
 
 
-def collected(run: Path) -> list[dict[str, Any]]:
-    """Reports of a run's collection rounds, without the single episodes."""
-    rounds = ReplayStore(run / "agpd").rounds()
-    return [{key: value for key, value in entry.report.items() if key != "episodes"} for entry in rounds]
-
-
 def evaluate_run(name: str, run: Path, config: ReportConfig) -> MethodResult:
     """Evaluate a run's last checkpoint, and the earlier ones for its learning curve."""
     steps = checkpoint_steps(run)
@@ -67,7 +61,7 @@ def evaluate_run(name: str, run: Path, config: ReportConfig) -> MethodResult:
     result = evaluate_policy(name, steps[last], config)
     if curve:
         result.curve = {**curve, last: result.final}
-    rounds = collected(run)
+    rounds = ReplayStore(run / "agpd").reports()
     if rounds:
         keys = ("generated", "successful", "kept")
         result.collection = {key: sum(entry[key] for entry in rounds) for key in keys} | {"rounds": rounds}

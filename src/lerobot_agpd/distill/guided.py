@@ -50,7 +50,7 @@ class Proposer:
 
     def propose(self, history: History) -> Tensor:
         """The chunk A_hat (B, S, A) at raw observations (B, T, ...), in the student's normalised space (Eq. 19)."""
-        policy = self.acting or self.student
+        policy: Any = self.acting or self.student
         batch = {}
         for key in self.config.input_features:
             recent = history[key][:, -self.n_obs_steps :]

@@ -115,7 +115,7 @@ class DistilledStudent(nn.Module):
     def update(self) -> None:
         """Advance the alternation; LeRobot calls this after every optimizer step, on every process."""
         if hasattr(super(), "update"):
-            super().update()
+            super().update()  # type: ignore[misc]
         if self._distillation is not None:
             self._distillation.after_update()
 

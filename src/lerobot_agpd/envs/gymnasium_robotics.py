@@ -20,9 +20,13 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE
 
 from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS, check_image_size, make_vector_env
-from lerobot_agpd.envs.robotics_tasks import KITCHEN, KITCHEN_DEFAULT, KITCHEN_TASKS, get_task_spec
-
-OBS_TYPES = ("state", "pixels", "pixels_agent_pos")
+from lerobot_agpd.envs.robotics_tasks import (
+    KITCHEN,
+    KITCHEN_DEFAULT,
+    KITCHEN_TASKS,
+    OBSERVED_KEYS,
+    get_task_spec,
+)
 
 
 def _require_gymnasium_robotics() -> None:
@@ -57,7 +61,7 @@ def make_single_env(
     Args:
         task: key of `TASKS`.
         gym_kwargs: passed on to `gymnasium.make`.
-        obs_type: one of `OBS_TYPES`.
+        obs_type: key of `OBSERVED_KEYS`.
         observation_size: height and width of observed images, pixels.
         visualization_size: height and width of rendered frames, pixels.
         shadows: whether images show shadows.
@@ -108,8 +112,10 @@ class GymnasiumRoboticsEnv(EnvConfig):
             ValueError: if an option is unknown or does not fit the task.
         """
         spec = get_task_spec(self.task)
-        if self.obs_type not in OBS_TYPES:
-            raise ValueError(f"--env.obs_type must be one of {', '.join(OBS_TYPES)}; got {self.obs_type!r}.")
+        if self.obs_type not in OBSERVED_KEYS:
+            raise ValueError(
+                f"--env.obs_type must be one of {', '.join(OBSERVED_KEYS)}; got {self.obs_type!r}."
+            )
         self.fps = spec.fps if self.fps is None else self.fps
         if self.fps != spec.fps:
             raise ValueError(
@@ -126,13 +132,8 @@ class GymnasiumRoboticsEnv(EnvConfig):
             ENVIRONMENT_STATE: (FeatureType.ENV, (spec.layout.environment_state_dim,)),
             PIXELS: (FeatureType.VISUAL, (self.observation_height, self.observation_width, 3)),
         }
-        observed = {
-            "state": (AGENT_POS, ENVIRONMENT_STATE),
-            "pixels": (PIXELS,),
-            "pixels_agent_pos": (AGENT_POS, PIXELS),
-        }
         self.features = {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(spec.action_dim,))}
-        for key in observed[self.obs_type]:
+        for key in OBSERVED_KEYS[self.obs_type]:
             self.features[key] = PolicyFeature(type=shapes[key][0], shape=shapes[key][1])
 
     def _check_kitchen_tasks(self) -> None:

@@ -10,10 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE
+from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS
 
 RawObservation = np.ndarray | dict[str, Any]
 Success = Callable[[Any, RawObservation, dict[str, Any]], bool]
+
+OBSERVED_KEYS: dict[str, tuple[str, ...]] = {
+    "state": (AGENT_POS, ENVIRONMENT_STATE),
+    "pixels": (PIXELS,),
+    "pixels_agent_pos": (AGENT_POS, PIXELS),
+}
+"""Raw keys of every `--env.obs_type`."""
 
 
 @dataclass(frozen=True)

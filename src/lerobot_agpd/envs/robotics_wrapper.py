@@ -9,14 +9,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
 from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS, image_space, unbounded
-from lerobot_agpd.envs.robotics_tasks import RawObservation, get_task_spec
-
-OBSERVED_KEYS: dict[str, tuple[str, ...]] = {
-    "state": (AGENT_POS, ENVIRONMENT_STATE),
-    "pixels": (PIXELS,),
-    "pixels_agent_pos": (PIXELS, AGENT_POS),
-}
-"""Raw keys of every `--env.obs_type`."""
+from lerobot_agpd.envs.robotics_tasks import OBSERVED_KEYS, RawObservation, get_task_spec
 
 
 @dataclass(frozen=True)

@@ -106,6 +106,13 @@ class ReplayStore:
         names = [*listed, *(path.name for path in found if path.name not in listed)]
         return [self._open(number, name) for number, name in enumerate(names)]
 
+    def reports(self) -> list[dict[str, Any]]:
+        """Reports of the finished rounds, without the single episodes."""
+        return [
+            {key: value for key, value in entry.report.items() if key != "episodes"}
+            for entry in self.rounds()
+        ]
+
     def _listed(self) -> list[str]:
         path = self.root / MANIFEST
         if not path.exists():

@@ -17,7 +17,7 @@ from lerobot.configs import parser
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.envs import EnvConfig
 
-from lerobot_agpd.analysis.comparison.matrix import Matrix, MethodEntry, TaskEntry, flat, reason
+from lerobot_agpd.comparison.matrix import Matrix, MethodEntry, TaskEntry, flat, reason
 from lerobot_agpd.guidance.config import require
 
 

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from lerobot_agpd.analysis.comparison.matrix import Matrix
-from lerobot_agpd.analysis.comparison.results import CHECKPOINTS, RunResult, compare, counts
 from lerobot_agpd.analysis.statistics import mean, success_rate
+from lerobot_agpd.comparison.matrix import Matrix
+from lerobot_agpd.comparison.results import CHECKPOINTS, RunResult, compare, counts
 
 Methods = Mapping[str, Sequence[RunResult]]
 """Method to its results, one per training seed."""

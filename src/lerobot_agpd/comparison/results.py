@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_agpd.analysis.comparison.evaluations import RESULT
-from lerobot_agpd.analysis.comparison.files import read_json
-from lerobot_agpd.analysis.comparison.matrix import MEASURES, Matrix
-from lerobot_agpd.analysis.comparison.runs import Run
-from lerobot_agpd.analysis.evaluation import Evaluation, Latency
+from lerobot_agpd.analysis.evaluation import Evaluation
+from lerobot_agpd.analysis.latency import Latency
 from lerobot_agpd.analysis.statistics import Difference, paired_difference
+from lerobot_agpd.comparison.evaluations import RESULT
+from lerobot_agpd.comparison.files import read_json
+from lerobot_agpd.comparison.matrix import MEASURES, Matrix
+from lerobot_agpd.comparison.runs import Run
 
 CHECKPOINTS = ("best", "last")
 

@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lerobot_agpd.analysis.comparison.matrix import MEASURES
-from lerobot_agpd.analysis.comparison.results import RunResult
+from lerobot_agpd.comparison.matrix import MEASURES
+from lerobot_agpd.comparison.results import RunResult
 
 
 def mean_curve(runs: Sequence[RunResult], measure: str) -> tuple[np.ndarray, np.ndarray]:

@@ -9,14 +9,16 @@ import pytest
 import yaml
 from scipy.stats import t
 
-from lerobot_agpd.analysis.comparison.curves import draw_curves, mean_curve
-from lerobot_agpd.analysis.comparison.evaluations import RESULT, best_step, read_evaluation
-from lerobot_agpd.analysis.comparison.files import read_json, write_json
-from lerobot_agpd.analysis.comparison.matrix import flat, load_matrix
-from lerobot_agpd.analysis.comparison.results import compare, read_result
-from lerobot_agpd.analysis.comparison.runs import check, environment, expand, parse_flags
-from lerobot_agpd.analysis.comparison.table import difference_rows, method_row, report, training_time
-from lerobot_agpd.analysis.comparison.training import (
+from lerobot_agpd.analysis.evaluation import Evaluation
+from lerobot_agpd.analysis.latency import Latency
+from lerobot_agpd.comparison.curves import draw_curves, mean_curve
+from lerobot_agpd.comparison.evaluations import RESULT, best_step, read_evaluation
+from lerobot_agpd.comparison.files import read_json, write_json
+from lerobot_agpd.comparison.matrix import flat, load_matrix
+from lerobot_agpd.comparison.results import compare, read_result
+from lerobot_agpd.comparison.runs import check, environment, expand, parse_flags
+from lerobot_agpd.comparison.table import difference_rows, method_row, report, training_time
+from lerobot_agpd.comparison.training import (
     StartLog,
     check_same_command,
     last_checkpoint,
@@ -26,7 +28,6 @@ from lerobot_agpd.analysis.comparison.training import (
     replay_parent,
     train_command,
 )
-from lerobot_agpd.analysis.evaluation import Evaluation, Latency
 
 pytest.importorskip("lerobot_policy_agpd")  # registers the policy and environment types
 

@@ -15,13 +15,13 @@ from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.envs import EnvConfig
 from lerobot.utils.random_utils import seeded_context
 
-from lerobot_agpd.analysis.comparison.files import read_json, write_json
-from lerobot_agpd.analysis.comparison.matrix import MEASURES, EvaluationEntry, Matrix
-from lerobot_agpd.analysis.comparison.provenance import provenance
-from lerobot_agpd.analysis.comparison.runs import Run, environment
-from lerobot_agpd.analysis.comparison.training import progress, read_starts, train_command
 from lerobot_agpd.analysis.evaluation import Checkpoint, Evaluation, checkpoint_steps
 from lerobot_agpd.analysis.statistics import success_rate
+from lerobot_agpd.comparison.files import read_json, write_json
+from lerobot_agpd.comparison.matrix import MEASURES, EvaluationEntry, Matrix
+from lerobot_agpd.comparison.provenance import provenance
+from lerobot_agpd.comparison.runs import Run, environment
+from lerobot_agpd.comparison.training import progress, read_starts, train_command
 
 logger = logging.getLogger(__name__)
 

@@ -30,9 +30,9 @@ from lerobot.utils.constants import (
     TRAINING_STATE_DIR,
 )
 
-from lerobot_agpd.analysis.comparison.files import read_json, write_json, write_text
-from lerobot_agpd.analysis.comparison.provenance import provenance
-from lerobot_agpd.analysis.comparison.runs import Run
+from lerobot_agpd.comparison.files import read_json, write_json, write_text
+from lerobot_agpd.comparison.provenance import provenance
+from lerobot_agpd.comparison.runs import Run
 from lerobot_agpd.distill.state import REPLAY_FOLDER, STATE_FILE
 
 COMMAND = "command.json"
