@@ -1,8 +1,6 @@
 """Commands and flags of the end-to-end tests: tiny networks, real environments."""
 
 import importlib.metadata
-import io
-import logging
 import os
 import subprocess
 import sys
@@ -69,17 +67,12 @@ def dataset_flags(root: Path) -> list[str]:
     return ["--dataset.repo_id=local/test", f"--dataset.root={root}"]
 
 
-def run_here(command: str, *flags: object) -> str:
-    """Run one of the console commands in this process, which saves importing everything anew; what it logged."""
+def run_here(command: str, *flags: object) -> None:
+    """Run one of the console commands in this process, which saves importing everything anew."""
     entry_points = importlib.metadata.entry_points(group="console_scripts", name=command)
     main = next(iter(entry_points)).load()
-    printed = io.StringIO()
-    handler = logging.StreamHandler(printed)
     argv, sys.argv = sys.argv, [command, *map(str, flags)]
     try:
-        logging.getLogger().addHandler(handler)
         main()
     finally:
         sys.argv = argv
-        logging.getLogger().removeHandler(handler)
-    return printed.getvalue()
