@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, DONE, REWARD, SUCCESS
+from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, DONE, OBS_PREFIX, REWARD, SUCCESS
 
 from lerobot_agpd.replay.episode import Array, Episode
 
@@ -46,7 +46,10 @@ class EpisodeWriter:
             if key in episode.observations:
                 self._check_shape(key, feature, episode.observations[key])
             elif key not in (ACTION, *OUTCOMES) or (key == SUCCESS and episode.successes is None):
-                logger.warning("collected episodes lack the demonstrations' feature '%s'", key)
+                if key.startswith(
+                    OBS_PREFIX
+                ):  # what else was noted down with the demonstrations, no policy reads
+                    logger.warning("collected episodes lack the demonstrations' feature '%s'", key)
                 continue
             chosen[key] = dict(feature)
         return {**chosen, **{key: dict(feature) for key, feature in ROUND_FEATURES.items()}}
