@@ -56,6 +56,24 @@ def page(folder: Path) -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def latency_page(path: Path) -> str:
+    """Milliseconds per chunk: median [95th percentile], one column per batch size."""
+    content = json.loads(path.read_text())
+    sizes = sorted({entry["batch_size"] for entry in content["entries"]})
+    header = ("", "parameters", "denoising steps", *(f"batch {size}" for size in sizes))
+    rows: dict[tuple[str, str], dict[int, dict]] = {}
+    for entry in content["entries"]:
+        rows.setdefault((entry["name"], entry["sampler"]), {})[entry["batch_size"]] = entry
+    lines = [header, tuple("---" for _ in header)]
+    for (name, sampler), cells in rows.items():
+        size = f"{cells[sizes[0]]['n_parameters'] / 1e6:.2f} M"
+        times = [f"{cells[n]['median_ms']:.1f} [{cells[n]['p95_ms']:.1f}]" for n in sizes]
+        lines.append((name, size, sampler, *times))
+    where = f"{content['device']}, {content['threads']} thread(s), torch {content['torch']}."
+    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return f"{(path.parent / 'README.md').read_text().rstrip()}\n\n{where}\n\n{table}\n"
+
+
 def readme(text: str, folder: Path) -> str:
     table = markdown(results(folder)).rstrip()
     pattern = re.compile(rf"(<!-- {folder.name}-results -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -67,6 +85,8 @@ def main() -> None:
     for folder in sorted(path.parent for path in (ROOT / "benchmarks").glob("*/report.json")):
         pages[ROOT / "docs" / "results" / f"{folder.name}.md"] = page(folder)
         pages[ROOT / "README.md"] = readme(pages[ROOT / "README.md"], folder)
+    for path in sorted((ROOT / "benchmarks" / "latency").glob("latency-*.json")):
+        pages[ROOT / "docs" / "results" / f"{path.stem}.md"] = latency_page(path)
     stale = [path for path, text in pages.items() if not path.exists() or path.read_text() != text]
     if "--check" in sys.argv:
         sys.exit(f"out of date, run benchmarks/render.py: {[str(p) for p in stale]}" if stale else 0)

@@ -7,99 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import PushtEnv
 from lerobot.policies import make_pre_post_processors
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
 from lerobot_agpd.cli import viz
 from lerobot_agpd.distill.loading import load_student
 from lerobot_agpd.guidance.config import TeacherConfig
-from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig
-from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
-from lerobot_agpd.policies.agpd.processor_agpd import make_agpd_pre_post_processors
-from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
-    DiffusionTransformerConfig,
-)
-from lerobot_agpd.policies.diffusion_transformer.modeling_diffusion_transformer import (
-    DiffusionTransformerPolicy,
-)
-from lerobot_agpd.policies.diffusion_transformer.processor_diffusion_transformer import (
-    make_diffusion_transformer_pre_post_processors,
-)
 
 pytest.importorskip("gym_pusht")
 RrdReader = pytest.importorskip("rerun.experimental").RrdReader
 
-INPUTS = {
-    OBS_STATE: PolicyFeature(type=FeatureType.STATE, shape=(2,)),
-    OBS_ENV_STATE: PolicyFeature(type=FeatureType.ENV, shape=(16,)),
-}
-OUTPUTS = {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(2,))}
-STATS = {
-    key: {
-        "min": torch.zeros(dim),
-        "max": torch.full((dim,), 512.0),
-        "mean": torch.full((dim,), 256.0),
-        "std": torch.full((dim,), 100.0),
-    }
-    for key, dim in ((OBS_STATE, 2), (OBS_ENV_STATE, 16), (ACTION, 2))
-}
 N_STEPS, EPISODE_LENGTH = 4, 10
-
-
-def save(policy, processors, path: Path) -> Path:
-    policy.save_pretrained(path)
-    for processor in processors:
-        processor.save_pretrained(path)
-    return path
-
-
-@pytest.fixture(scope="module")
-def teacher(tmp_path_factory) -> Path:
-    config = DiffusionTransformerConfig(
-        prediction_type="epsilon",  # a random predictor of clean chunks would not feel the pull
-        input_features=INPUTS,
-        output_features=OUTPUTS,
-        device="cpu",
-        push_to_hub=False,
-        horizon=8,
-        n_action_steps=N_STEPS,
-        drop_n_last_frames=3,
-        num_train_timesteps=20,
-        num_inference_steps=5,
-    )
-    config.mlp.width, config.mlp.n_blocks = 32, 1
-    torch.manual_seed(0)
-    processors = make_diffusion_transformer_pre_post_processors(config, STATS)
-    return save(DiffusionTransformerPolicy(config), processors, tmp_path_factory.mktemp("teacher"))
-
-
-def make_student(path: Path, teacher: Path, representation: str = "action") -> Path:
-    config = AGPDConfig(
-        input_features=INPUTS,
-        output_features=OUTPUTS,
-        device="cpu",
-        push_to_hub=False,
-        chunk_size=8,
-        n_action_steps=N_STEPS,
-        dim_model=32,
-        n_heads=2,
-        dim_feedforward=32,
-        n_encoder_layers=1,
-        n_vae_encoder_layers=1,
-        latent_dim=4,
-    )
-    config.teacher.path = str(teacher)
-    config.guidance.scale = 2.0
-    config.representation.type = representation
-    torch.manual_seed(1)
-    return save(AGPDPolicy(config), make_agpd_pre_post_processors(config, STATS), path)
-
-
-@pytest.fixture
-def student(tmp_path, teacher) -> Path:
-    return make_student(tmp_path / "run/checkpoints/000010/pretrained_model", teacher)
 
 
 def call(monkeypatch, *options: str) -> None:
@@ -149,9 +68,9 @@ def test_decisions_and_frames_belong_to_the_steps(monkeypatch, student):
 
 @pytest.mark.parametrize("representation", ["action", "state"])
 def test_guidance_pulls_toward_the_student_from_the_same_noise(
-    monkeypatch, tmp_path, teacher, representation
+    monkeypatch, tmp_path, teacher, representation, student_of
 ):
-    student = make_student(tmp_path / "student", teacher, representation)
+    student = student_of(tmp_path / "student", teacher, representation)
     config = make_config(monkeypatch, student, render=False)
     ((_, unguided),) = rollouts(config, scale=0.0)
     ((_, guided),) = rollouts(config, scale=50.0)
@@ -172,7 +91,7 @@ def test_student_chunk_is_what_the_policy_executes(monkeypatch, student):
     ((episode, rollout),) = rollouts(config, scale=0.0)
     loaded = load_student(config.policy)
     preprocessor, postprocessor = make_pre_post_processors(config.policy, pretrained_path=str(student))
-    observation = {key: torch.from_numpy(episode.observations[key][0]) for key in INPUTS}
+    observation = {key: torch.from_numpy(episode.observations[key][0]) for key in (OBS_STATE, OBS_ENV_STATE)}
     chunk = loaded.student.predict_action_chunk(preprocessor(observation))[:, :N_STEPS]
     np.testing.assert_allclose(rollout.decisions[0].chunks.student, postprocessor(chunk)[0], rtol=1e-5)
 

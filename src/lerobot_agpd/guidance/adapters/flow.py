@@ -7,31 +7,23 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lerobot_agpd.guidance.adapters.diffusion import set_diffusion_sampler, stack_cameras
+from lerobot_agpd.guidance.adapters.diffusion import (
+    DiffusionTeacher,
+    set_diffusion_sampler,
+    stack_cameras,
+)
 from lerobot_agpd.guidance.config import GUIDANCE_POINTS
 from lerobot_agpd.guidance.flow import guided_velocity
 from lerobot_agpd.guidance.guide import Guide, guided
-from lerobot_agpd.guidance.teacher import Teacher, seeded_by
+from lerobot_agpd.guidance.teacher import seeded_by
 
 
-class MultiTaskDiTTeacher(Teacher):
+class MultiTaskDiTTeacher(DiffusionTeacher):
     """A MultiTaskDiTPolicy (arXiv:2507.05331), guided as its objective denoises.
 
     With `objective=diffusion` the scheduler's steps are shifted as for a diffusion policy, with
     `objective=flow_matching` the velocity is. Its chunk starts n_obs_steps - 1 steps in the past.
     """
-
-    can_be_guided = True
-
-    @property
-    def start(self) -> int:
-        """Index of the current step in its internal chunk."""
-        return self.n_obs_steps - 1
-
-    @property
-    def n_chunk_steps(self) -> int:
-        """Steps of a chunk from the current one on."""
-        return self.policy.config.horizon - self.start
 
     @property
     def resizes_images(self) -> bool:
