@@ -4,6 +4,7 @@ import json
 import sys
 
 import pytest
+from lerobot.envs.configs import PushtEnv
 
 from lerobot_agpd.cli import diversity
 
@@ -48,15 +49,16 @@ def test_sweep_measures_every_setting(monkeypatch, student, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("flag", "message"),
+    ("options", "message"),
     [
-        ("--scales=[0]", "--scales must be positive"),
-        ("--lambdas=[1]", "--lambdas must lie between 0 and 1"),
-        ("--forms=[swap]", r"--forms must be interpolate or switch, got \['swap'\]"),
-        ("--episodes=1", "--episodes must be at least 2"),
-        ("--axes=[0]", "--axes must name two"),
+        ({"scales": [0.0]}, "--scales must be positive"),
+        ({"lambdas": [1.0]}, "--lambdas must lie between 0 and 1"),
+        ({"forms": ["swap"]}, r"--forms must be interpolate or switch, got \['swap'\]"),
+        ({"episodes": 1}, "--episodes must be at least 2"),
+        ({"axes": [0]}, "--axes must name two"),
     ],
 )
-def test_wrong_options_are_refused(monkeypatch, student, tmp_path, flag, message):
+def test_wrong_options_are_refused(monkeypatch, student, tmp_path, options, message):
+    monkeypatch.setattr(sys, "argv", ["lerobot-agpd-diversity", f"--policy.path={student}"])
     with pytest.raises(ValueError, match=message):
-        call(monkeypatch, student, flag, f"--output={tmp_path}")
+        diversity.DiversityConfig(env=PushtEnv(), output=tmp_path, **options)
