@@ -33,7 +33,7 @@ train act_student "$few" student_cpu 4000 "${rounds[@]}" "${env[@]}" \
 train dp_t_cloning "$few" self_distil_cpu 4000 "${alone[@]}"
 train dp_t_self "$few" self_distil_cpu 4000 "${rounds[@]}" "${env[@]}"
 
-lerobot-agpd-report "${env[@]}" --output="$output/report" --title="FetchPush, 20 demonstrations" --episodes=300 --curve_episodes=50 \
+lerobot-agpd-report "${env[@]}" --output="$output/report" --title="FetchPush, 20 demonstrations" --episodes=300 \
     --policies="{ACT-DP teacher: $output/act_dp/checkpoints/last/pretrained_model}" \
     --runs="{ACT cloning: $output/act_cloning, ACT student of ACT-DP: $output/act_student, \
 DP-T cloning: $output/dp_t_cloning, DP-T self-distilled: $output/dp_t_self}"
