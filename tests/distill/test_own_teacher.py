@@ -6,6 +6,7 @@ import torch
 from lerobot_agpd.collect.config import CollectConfig
 from lerobot_agpd.distill.config import AdversaryConfig
 from lerobot_agpd.distill.own_teacher import OwnTeacher
+from lerobot_agpd.guidance.config import RepresentationConfig
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
 from lerobot_agpd.policies.agpd_diffusion.modeling_agpd_diffusion import AGPDDiffusionPolicy
 from lerobot_agpd.run import RunInfo, declared_run
@@ -88,3 +89,22 @@ def test_the_adversary_compares_with_executed_chunks_of_collected_rows(student, 
 def test_an_act_student_cannot_teach_itself(agpd_config):
     with pytest.raises(NotImplementedError, match="'agpd' policy cannot teach itself.*--policy.teacher.path"):
         AGPDPolicy(agpd_config()).snapshot()
+
+
+def test_the_representation_learns_from_what_is_executed_now(
+    agpd_diffusion_config, demonstrations, loop_batch
+):
+    """A diffusion student's chunk starts in the past; the step before now does not lead to the future observation."""
+    config = agpd_diffusion_config(representation=RepresentationConfig(type="state", width=16, n_heads=2))
+    student = AGPDDiffusionPolicy(config, demonstrations.meta.stats, demonstrations.meta)
+    config.collect, config.adversary = CollectConfig(every=0), AdversaryConfig(weight=0)
+    with declared_run(RunInfo()):
+        distillation = student.distillation
+        rows = distillation.training_rows(loop_batch(config, [0, 6]))
+        loss, _ = distillation._representation_loss(rows)
+        past = {**rows, "action": rows["action"].clone()}
+        past["action"][:, 0] += 1
+        assert distillation._representation_loss(past)[0] == loss
+        executed = {**rows, "action": rows["action"].clone()}
+        executed["action"][:, config.n_action_steps] += 1  # the last of the executed steps 1 .. n
+        assert distillation._representation_loss(executed)[0] != loss

@@ -32,7 +32,7 @@ from lerobot_agpd.collect.seeds import noise_seed
 from lerobot_agpd.collect.strategies import round_strength
 from lerobot_agpd.distill.adversary import adversary_terms
 from lerobot_agpd.distill.environment import check_environment_fits, run_environment
-from lerobot_agpd.distill.guided import Proposer, future_steps
+from lerobot_agpd.distill.guided import Proposer, future_steps, present_step
 from lerobot_agpd.distill.own_teacher import OwnTeacher
 from lerobot_agpd.distill.relabel import TeacherChunks
 from lerobot_agpd.distill.round_log import log_round, round_scalars
@@ -195,7 +195,7 @@ class Distillation:
         chosen = torch.ones_like(rows[ROW], dtype=torch.bool)
         if self.config.replay.relabel == "demonstrations":
             chosen = rows[ROW] < self.replay.n_demonstration_frames
-        present = self.config.chunk_offsets.index(0)
+        present = present_step(self.config)
         action, is_pad = rows[ACTION].clone(), rows["action_is_pad"].clone()
         action[chosen, present : present + shared] = chunks[chosen, :shared]
         is_pad[chosen, present : present + shared] = False
@@ -271,7 +271,7 @@ class Distillation:
 
     def extra_losses(self, rows: Batch) -> tuple[Tensor, dict[str, float]]:
         """What AGPD adds to L_IL on rows of T: the adversarial game and the representation's loss."""
-        total = torch.zeros((), device=rows["action"].device)
+        total = torch.zeros((), device=rows[ACTION].device)
         log: dict[str, float] = {}
         for loss, entries in (self._adversarial_loss(rows), self._representation_loss(rows)):
             total = total + loss
@@ -313,7 +313,7 @@ class Distillation:
             return rows, chunks, compared.expand(len(chunks), -1)
         kept = rows[ROW] >= self.replay.n_demonstration_frames
         rows = {key: value[kept] for key, value in rows.items()}
-        present = self.config.chunk_offsets.index(0)
+        present = present_step(self.config)
         return rows, rows[ACTION][:, present:], ~rows["action_is_pad"][:, present:]
 
     def _representation_loss(self, rows: Batch) -> tuple[Tensor | float, dict[str, float]]:
@@ -322,7 +322,8 @@ class Distillation:
             return 0.0, {}
         n_steps = representation.n_steps
         now, later, is_pad = self.replay.executed_future(rows[ROW], self.replay.vector_keys, n_steps)
-        predicted = representation(now, rows["action"][:, :n_steps])
+        present = present_step(self.config)
+        predicted = representation(now, rows[ACTION][:, present : present + n_steps])
         loss = reconstruction_loss(predicted, later, is_pad)
         return self.config.representation.weight * loss, {"representation_loss": loss.item()}
 
