@@ -1,4 +1,4 @@
-"""Milliseconds per action chunk of every teacher and student, at published sizes and at the CPU presets.
+"""Milliseconds per action chunk of teachers and of the ACT student, at published and at smaller sizes.
 
 All of it in one run on one machine: teachers with 100 (DDPM), 16 and 10 (DDIM) denoising steps, batch 1 (a robot) and 22
 (the environments of an evaluation). Weights are random: they do not change the time. The features are those of Push-T's
@@ -8,7 +8,6 @@ usage: python benchmarks/latency/latency.py [--device=cuda] [--threads=1] [--qui
 
 import argparse
 import json
-import platform
 from dataclasses import asdict
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from lerobot.policies import get_policy_class
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_agpd.analysis.latency import chunk_latency
+from lerobot_agpd.comparison.provenance import provenance
 
 FEATURES = {
     "input_features": {
@@ -102,17 +102,10 @@ def main() -> None:
             entries += measure(name, sampler, policy, options.quick)
     if options.quick:
         return
-    device = torch.cuda.get_device_name() if options.device == "cuda" else cpu_name()
+    device = torch.cuda.get_device_name() if options.device == "cuda" else provenance()["host"]["cpu"]
     content = {"device": device, "threads": options.threads, "torch": torch.__version__, "entries": entries}
     path = Path(__file__).with_name(f"latency-{options.device}.json")
     path.write_text(json.dumps(content, indent=1) + "\n")
-
-
-def cpu_name() -> str:
-    """The processor's model name."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor()
 
 
 if __name__ == "__main__":

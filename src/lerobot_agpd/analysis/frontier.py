@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 COLOURS = {"replay": "k", "guided": "C1", "interpolate": "C0", "switch": "C2"}
 NAMES = {
@@ -29,8 +30,8 @@ def plot_frontier(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         rows: `SweepRow.to_json()` of every setting.
         path: of the picture.
     """
-    pyplot = _pyplot()
-    figure, axes = pyplot.subplots(1, len(PANELS), figsize=(13, 4), constrained_layout=True)
+    figure = Figure(figsize=(13, 4), layout="constrained", dpi=120)
+    axes = figure.subplots(1, len(PANELS))
     for axis, (key, label) in zip(axes, PANELS, strict=True):
         for strategy in dict.fromkeys(row["setting"]["strategy"] for row in rows):
             points = sorted(
@@ -49,8 +50,7 @@ def plot_frontier(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
                 )
         axis.set(xlabel="rms distance of actions from the teacher's", ylabel=label, xscale="log")
     axes[0].legend(fontsize=8)
-    figure.savefig(path, dpi=120)
-    pyplot.close(figure)
+    figure.savefig(path)
 
 
 def plot_trajectories(
@@ -64,24 +64,12 @@ def plot_trajectories(
         path: of the picture.
         limit: episodes drawn.
     """
-    pyplot = _pyplot()
-    figure, axes = pyplot.subplots(
-        1, len(episodes), figsize=(4.2 * len(episodes), 4), constrained_layout=True, sharex=True, sharey=True
-    )
+    figure = Figure(figsize=(4.2 * len(episodes), 4), layout="constrained", dpi=120)
+    axes = figure.subplots(1, len(episodes), sharex=True, sharey=True)
     for axis, (name, played) in zip(np.atleast_1d(axes), episodes.items(), strict=True):
         for number, episode in enumerate(played[:limit]):
             states = episode.observations["observation.state"]
             axis.plot(*states[:, list(dims)].T, color=f"C{number % 10}", lw=1, alpha=0.8)
             axis.plot(*states[0, list(dims)], "o", color=f"C{number % 10}", ms=3)
         axis.set(title=name, xlabel=f"state {dims[0]}", ylabel=f"state {dims[1]}", aspect="equal")
-    figure.savefig(path, dpi=120)
-    pyplot.close(figure)
-
-
-def _pyplot() -> Any:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    return pyplot
+    figure.savefig(path)

@@ -18,6 +18,7 @@ from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_proc
 from lerobot.utils.random_utils import seeded_context
 
 from lerobot_agpd.analysis.diversity import knn_entropy, state_coverage
+from lerobot_agpd.collect.config import VariationConfig
 from lerobot_agpd.collect.decider import Decider
 from lerobot_agpd.collect.diagnostics import action_diagnostics, state_path
 from lerobot_agpd.collect.rollout import Rollouts
@@ -62,12 +63,12 @@ class SweepRow:
 
 
 def configured(policy_config: Any, setting: Setting) -> Any:
-    """The student's configuration with one setting's strategy, watched at `diagnostics.observations` decisions."""
+    """The student's configuration with one setting's strategy, without variations of guidance."""
     config = deepcopy(policy_config)
     mixing = setting.strategy in ("interpolate", "switch")
     config.collect.strategy = "mixing" if mixing else setting.strategy
     config.collect.mixing.form = setting.strategy if mixing else config.collect.mixing.form
-    config.collect.variation = type(config.collect.variation)()
+    config.collect.variation = VariationConfig()
     return config
 
 

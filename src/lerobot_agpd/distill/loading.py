@@ -77,7 +77,7 @@ def load_student(config: PreTrainedConfig) -> Proposer:
 
 
 def load_pair(
-    policy_config: Any, overrides: TeacherConfig, env_config: EnvConfig, to_guide: bool = True
+    policy_config: Any, overrides: TeacherConfig, env_config: EnvConfig
 ) -> tuple[Proposer, Teacher]:
     """A student and the teacher it was distilled from.
 
@@ -85,10 +85,9 @@ def load_pair(
         policy_config: the student's, with `pretrained_path`.
         overrides: what is set replaces the checkpoint's `teacher.*`.
         env_config: where they are to act.
-        to_guide: whether the teacher must be one that can be guided.
 
     Raises:
-        ValueError: if teacher, student and environment do not fit together.
+        ValueError: if teacher, student and environment do not fit together, or the teacher cannot be guided.
     """
     chosen = {key: value for key, value in asdict(overrides).items() if value}
     teacher = load_teacher(replace(policy_config.teacher, **chosen), policy_config.device)
@@ -97,6 +96,6 @@ def load_pair(
         teacher,
         env_to_policy_features(env_config),
         policy_config.action_feature,
-        policy_config.guidance if to_guide else None,
+        policy_config.guidance,
     )
     return load_student(policy_config), teacher
