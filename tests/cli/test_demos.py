@@ -11,7 +11,8 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_agpd.cli import demos
 from lerobot_agpd.cli.demos import DemosConfig, DemosReport, record_demos, successful_episodes
-from lerobot_agpd.envs.experts import fetch_reach_expert
+from lerobot_agpd.envs.experts.base import Expert
+from lerobot_agpd.envs.experts.fetch import fetch_reach_expert
 from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
 from lerobot_agpd.envs.robotics_tasks import TASKS
 
@@ -177,7 +178,7 @@ def test_trivial_starts_and_failures_are_left_out_and_counted(tmp_path):
 
 
 def test_an_expert_that_never_succeeds_ends_in_an_error_and_leaves_no_dataset(tmp_path, monkeypatch):
-    monkeypatch.setattr(demos, "make_expert", lambda task: lazy_expert)
+    monkeypatch.setattr(demos, "make_expert", lambda env: Expert(lazy_expert))
     with pytest.raises(RuntimeError, match="Only 0 of 1 episodes succeeded in 10 attempts"):
         record_demos(reach_config(tmp_path / "x", episodes=1))
     assert not (tmp_path / "x").exists()
@@ -204,7 +205,7 @@ def test_seeds_of_evaluations_are_refused(tmp_path, seed, episodes):
 
 
 def test_seeds_never_run_into_those_of_evaluations(tmp_path, monkeypatch):
-    monkeypatch.setattr(demos, "make_expert", lambda task: lazy_expert)
+    monkeypatch.setattr(demos, "make_expert", lambda env: Expert(lazy_expert))
     with pytest.raises(RuntimeError, match="next seed 100000"):
         record_demos(reach_config(tmp_path / "x", seed=99_998, episodes=2))
 
@@ -217,6 +218,5 @@ def test_other_requests_that_cannot_work_are_refused(tmp_path):
     for skill in (1.5, -0.1, [], [1.0, 2.0]):
         with pytest.raises(ValueError, match="--skill=.* must be one or several numbers"):
             reach_config(tmp_path / "x", skill=skill)
-    slide = DemosConfig(root=tmp_path / "x", env=GymnasiumRoboticsEnv(task="FetchSlide-v4"))
-    with pytest.raises(ValueError, match="No scripted expert"):
-        record_demos(slide)
+    with pytest.raises(ValueError, match="FetchSlide-v4 has no scripted expert"):
+        DemosConfig(root=tmp_path / "x", env=GymnasiumRoboticsEnv(task="FetchSlide-v4"))

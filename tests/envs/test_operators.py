@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from lerobot_agpd.envs.experts import EXPERTS, make_expert
+from lerobot_agpd.envs.experts.base import Expert
+from lerobot_agpd.envs.experts.fetch import EXPERTS
 from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
 from lerobot_agpd.envs.operators import (
     DETOUR_ANGLE,
@@ -28,13 +29,13 @@ AT_ORIGIN = {"agent_pos": np.zeros(10, dtype=np.float32), "environment_state": n
 
 def actions_of(action: np.ndarray, skill: float, steps: int, seed: int = 0) -> np.ndarray:
     """(steps, 4) actions of an operator whose expert always wants the same."""
-    operator = Operator(lambda observation: action, skill, np.random.default_rng(seed))
+    operator = Operator(Expert(lambda observation: action), skill, np.random.default_rng(seed))
     return np.stack([operator(AT_ORIGIN) for _ in range(steps)])
 
 
 def test_full_skill_is_the_expert_and_leaves_the_random_numbers_alone():
     rng = np.random.default_rng(3)
-    operator = Operator(lambda observation: FORWARD, 1.0, rng)
+    operator = Operator(Expert(lambda observation: FORWARD), 1.0, rng)
     for _ in range(20):
         np.testing.assert_array_equal(operator(AT_ORIGIN), FORWARD)
     assert rng.random() == np.random.default_rng(3).random()
@@ -108,7 +109,7 @@ def test_slips_move_the_hand_off_and_reverse_the_gripper(monkeypatch):
 @pytest.mark.parametrize("skill", [-0.1, 1.1, float("nan")])
 def test_impossible_skill_is_refused(skill):
     with pytest.raises(ValueError, match=r"\[0, 1\]"):
-        Operator(lambda observation: STILL, skill, np.random.default_rng(0))
+        Operator(Expert(lambda observation: STILL), skill, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("task", EXPERTS)
@@ -120,7 +121,7 @@ def test_less_skill_succeeds_less_often_but_not_never(task):
         outcomes = []
         for seed in range(10):
             env.reset(seed=seed)
-            operator = Operator(make_expert(task), skill, np.random.default_rng(seed))
+            operator = Operator(EXPERTS[task], skill, np.random.default_rng(seed))
             truncated = False
             while not truncated:
                 _, _, _, truncated, info = env.step(operator(env.state))

@@ -26,8 +26,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from lerobot_agpd.collect.config import EVALUATION_SEEDS
+from lerobot_agpd.envs.base import SingleEnvConfig
 from lerobot_agpd.envs.demonstrations import DemosReport, Frame, play_episode
-from lerobot_agpd.envs.experts import Expert, make_expert
+from lerobot_agpd.envs.experts import make_expert
+from lerobot_agpd.envs.experts.base import Expert
 from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
 from lerobot_agpd.envs.operators import Operator
 
@@ -55,12 +57,11 @@ class DemosConfig:
         """Check the options.
 
         Raises:
-            ValueError: if the environment is of another type, no episode is wanted or the seeds reach those of
+            ValueError: if the task has no expert, no episode is wanted or the seeds reach those of
                 evaluations.
             FileExistsError: if `root` exists.
         """
-        if not isinstance(self.env, GymnasiumRoboticsEnv):
-            raise ValueError(f"--env.type={self.env.type} has no scripted experts; use gymnasium_robotics.")
+        make_expert(self.env)
         if not self.skills or not all(0 <= skill <= 1 for skill in self.skills):
             raise ValueError(f"--skill={self.skill} must be one or several numbers in [0, 1].")
         if self.episodes < 1:
@@ -154,11 +155,11 @@ def record_demos(config: DemosConfig) -> DemosReport:
     Raises:
         ValueError: if the task has no expert.
         RuntimeError: if too few episodes succeed.
-        ModuleNotFoundError: if Gymnasium-Robotics is not installed.
+        ModuleNotFoundError: if the package of the environment is not installed.
     """
-    assert isinstance(config.env, GymnasiumRoboticsEnv)
-    expert = make_expert(config.env.gym_id)
-    report = DemosReport(task=config.env.gym_id)
+    assert isinstance(config.env, SingleEnvConfig)  # all those with experts are
+    expert = make_expert(config.env)
+    report = DemosReport(task=str(config.env.task))
     env = config.env.make_single()
     try:
         partial = new_partial_root(config.root)

@@ -9,12 +9,18 @@ from functools import partial
 from typing import Any
 
 import gymnasium as gym
-from gymnasium.vector import VectorEnv
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import AlohaEnv as LeRobotAlohaEnv, EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
-from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS, check_image_size, make_vector_env
+from lerobot_agpd.envs.base import (
+    AGENT_POS,
+    ENVIRONMENT_STATE,
+    PIXELS,
+    SingleEnvConfig,
+    check_image_size,
+    require_packages,
+)
 
 FPS = 50
 CAMERAS = ("top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist")
@@ -33,22 +39,6 @@ OBSERVED_KEYS: dict[str, tuple[str, ...]] = {
 """Raw keys of every `--env.obs_type`."""
 
 
-def _require_gym_aloha() -> None:
-    """Import gym_aloha.
-
-    Raises:
-        ModuleNotFoundError: if it or something that it needs is not installed.
-    """
-    try:
-        import gym_aloha  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            f"The aloha_state environments need the package {error.name!r}, which is not installed. "
-            "Run: pip install 'lerobot_policy_agpd[aloha]'",
-            name=error.name,
-        ) from error
-
-
 def make_single_env(task: str, episode_length: int, kwargs: dict[str, Any]) -> gym.Env:
     """Build one environment; a worker process that has imported nothing yet can call it.
 
@@ -60,7 +50,7 @@ def make_single_env(task: str, episode_length: int, kwargs: dict[str, Any]) -> g
     Raises:
         ModuleNotFoundError: if gym_aloha is not installed.
     """
-    _require_gym_aloha()
+    require_packages(["gym_aloha"], "aloha_state", extra="aloha")
     from lerobot_agpd.envs.aloha_sim import AlohaStateEnv
     from lerobot_agpd.envs.workers import TASKS as DESCRIPTIONS, TaskDescription
 
@@ -71,7 +61,7 @@ def make_single_env(task: str, episode_length: int, kwargs: dict[str, Any]) -> g
 
 @EnvConfig.register_subclass("aloha_state")
 @dataclass
-class AlohaStateEnvConfig(LeRobotAlohaEnv):
+class AlohaStateEnvConfig(SingleEnvConfig, LeRobotAlohaEnv):
     """ALOHA's simulated tasks, seen through joints and object poses, or through cameras of any size."""
 
     task: str | None = "AlohaTransferCube-v0"  # or AlohaInsertion-v0
@@ -137,25 +127,6 @@ class AlohaStateEnvConfig(LeRobotAlohaEnv):
         }
 
     @property
-    def _factory(self) -> partial[gym.Env]:
+    def factory(self) -> partial[gym.Env]:
+        """Builds one environment; see `make_single_env`."""
         return partial(make_single_env, str(self.task), self.episode_length, self.gym_kwargs)
-
-    def make_single(self) -> gym.Env:
-        """Build one environment outside any vector environment; see `make_single_env`."""
-        return self._factory()
-
-    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
-        """Build the vector environment; see `base.make_vector_env`.
-
-        Args:
-            n_envs: number of environments.
-            use_async_envs: one process per environment, if there are at least two.
-
-        Returns:
-            `{"aloha_state": {0: vector environment}}`.
-
-        Raises:
-            ModuleNotFoundError: if gym_aloha is not installed.
-        """
-        _require_gym_aloha()
-        return {self.type: {0: make_vector_env(self._factory, n_envs, use_async_envs)}}

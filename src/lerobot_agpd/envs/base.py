@@ -1,6 +1,8 @@
-"""What the environment types share: raw observation keys and the vector environment."""
+"""What the environment types share: raw observation keys, how one environment is built and how many."""
 
-from collections.abc import Callable
+import importlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 
 import gymnasium as gym
 import numpy as np
@@ -52,3 +54,58 @@ def make_vector_env(factory: Callable[[], gym.Env], n_envs: int, use_async_envs:
     if use_async_envs and n_envs > 1:
         return AsyncVectorEnv(factories, context="forkserver", autoreset_mode=AutoresetMode.SAME_STEP)
     return SyncVectorEnv(factories, autoreset_mode=AutoresetMode.SAME_STEP)
+
+
+def require_packages(names: Sequence[str], env_type: str, extra: str) -> None:
+    """Import packages that an optional extra of this one installs.
+
+    Args:
+        names: the packages; importing them registers their environments.
+        env_type: who needs them.
+        extra: that brings them.
+
+    Raises:
+        ModuleNotFoundError: naming the extra, if one of them or something that it needs is not installed.
+    """
+    try:
+        for name in names:
+            importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            f"The {env_type} environments need the package {error.name!r}, which is not installed. "
+            f"Run: pip install 'lerobot_policy_agpd[{extra}]'",
+            name=error.name,
+        ) from error
+
+
+class SingleEnvConfig(ABC):
+    """Mixin for an `EnvConfig` whose environments are built from a factory, alone or several at a time."""
+
+    # Of EnvConfig:
+    type: str
+    task: str | None
+    fps: int
+
+    @property
+    @abstractmethod
+    def factory(self) -> Callable[[], gym.Env]:
+        """Builds one environment; picklable, for worker processes that have imported nothing yet."""
+
+    def make_single(self) -> gym.Env:
+        """Build one environment outside any vector environment."""
+        return self.factory()
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
+        """Build the vector environment; see `make_vector_env`.
+
+        Args:
+            n_envs: number of environments.
+            use_async_envs: one process per environment, if there are at least two.
+
+        Returns:
+            `{type: {0: vector environment}}`.
+
+        Raises:
+            ModuleNotFoundError: if the package of the environment is not installed.
+        """
+        return {self.type: {0: make_vector_env(self.factory, n_envs, use_async_envs)}}

@@ -1,5 +1,6 @@
 """Episodes of a scripted expert as dataset frames, and the count of what happened to the attempts."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 from lerobot.utils.constants import ACTION, DONE, REWARD, SUCCESS
 from rich.table import Table
 
-from lerobot_agpd.envs.experts import Expert
+from lerobot_agpd.envs.experts.base import Observation
 
 Frame = dict[str, Any]
 
@@ -68,7 +69,9 @@ class DemosReport:
         return table
 
 
-def play_episode(env: gym.Env, expert: Expert, seed: int, features_map: dict[str, str]) -> list[Frame] | None:
+def play_episode(
+    env: gym.Env, expert: Callable[[Observation], np.ndarray], seed: int, features_map: dict[str, str]
+) -> list[Frame] | None:
     """Let the expert play one episode to its end.
 
     Args:

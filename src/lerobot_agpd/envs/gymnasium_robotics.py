@@ -14,12 +14,18 @@ from functools import partial
 from typing import Any
 
 import gymnasium as gym
-from gymnasium.vector import VectorEnv
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE
 
-from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS, check_image_size, make_vector_env
+from lerobot_agpd.envs.base import (
+    AGENT_POS,
+    ENVIRONMENT_STATE,
+    PIXELS,
+    SingleEnvConfig,
+    check_image_size,
+    require_packages,
+)
 from lerobot_agpd.envs.robotics_tasks import (
     KITCHEN,
     KITCHEN_DEFAULT,
@@ -27,23 +33,6 @@ from lerobot_agpd.envs.robotics_tasks import (
     OBSERVED_KEYS,
     get_task_spec,
 )
-
-
-def _require_gymnasium_robotics() -> None:
-    """Import Gymnasium-Robotics, which registers its environments with gymnasium.
-
-    Raises:
-        ModuleNotFoundError: if it or something that it needs is not installed.
-    """
-    try:
-        import gymnasium_robotics  # noqa: F401
-        import mujoco  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            f"The gymnasium_robotics environments need the package {error.name!r}, which is not installed. "
-            "Run: pip install 'lerobot_policy_agpd[fetch]'",
-            name=error.name,
-        ) from error
 
 
 def make_single_env(
@@ -70,7 +59,7 @@ def make_single_env(
         ModuleNotFoundError: if Gymnasium-Robotics is not installed.
         ValueError: if the task is not known.
     """
-    _require_gymnasium_robotics()
+    require_packages(["gymnasium_robotics", "mujoco"], "gymnasium_robotics", extra="fetch")
     from lerobot_agpd.envs.robotics_wrapper import RoboticsWrapper, View
 
     view = View(obs_type, observation_size, visualization_size, shadows)
@@ -79,7 +68,7 @@ def make_single_env(
 
 @EnvConfig.register_subclass("gymnasium_robotics")
 @dataclass
-class GymnasiumRoboticsEnv(EnvConfig):
+class GymnasiumRoboticsEnv(SingleEnvConfig, EnvConfig):
     """Tasks of Gymnasium-Robotics, seen through their state or one camera."""
 
     task: str | None = "FetchPickAndPlace-v4"  # FetchReach-v4, ..., AdroitHandDoor-v1, ..., FrankaKitchen-v1
@@ -177,7 +166,8 @@ class GymnasiumRoboticsEnv(EnvConfig):
         return kwargs
 
     @property
-    def _factory(self) -> partial[gym.Env]:
+    def factory(self) -> partial[gym.Env]:
+        """Builds one environment; see `make_single_env`."""
         return partial(
             make_single_env,
             self.gym_id,
@@ -187,23 +177,3 @@ class GymnasiumRoboticsEnv(EnvConfig):
             (self.visualization_height, self.visualization_width),
             self.shadows,
         )
-
-    def make_single(self) -> gym.Env:
-        """Build one environment outside any vector environment; see `make_single_env`."""
-        return self._factory()
-
-    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
-        """Build the vector environment; see `base.make_vector_env`.
-
-        Args:
-            n_envs: number of environments.
-            use_async_envs: one process per environment, if there are at least two.
-
-        Returns:
-            `{"gymnasium_robotics": {0: vector environment}}`.
-
-        Raises:
-            ModuleNotFoundError: if Gymnasium-Robotics is not installed.
-        """
-        _require_gymnasium_robotics()
-        return {self.type: {0: make_vector_env(self._factory, n_envs, use_async_envs)}}

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from lerobot_agpd.envs.experts import Array, Expert
+from lerobot_agpd.envs.experts.base import Array, Expert, Observation
 
 # All of these are reached at skill 0 and fall linearly to nothing at skill 1.
 SLOWNESS = 0.3  # share of the speed that is lost
@@ -33,7 +33,7 @@ def bent_path(action: Array, hand: Array, skill: float) -> Array:
     The angle stays below 90 degrees: every step still gets closer to where the expert wanted to go.
 
     Args:
-        action: (4,) displacement x, y, z and gripper, action units.
+        action: (4,) displacement x, y, z in [-1, 1], and gripper.
         hand: (3,) position of the hand, metres.
         skill: 1 returns the action unchanged, 0 bends it most.
 
@@ -54,6 +54,57 @@ def bent_path(action: Array, hand: Array, skill: float) -> Array:
     return np.append((1.0 - SLOWNESS * lapse) * turned, action[3])
 
 
+class Lapses:
+    """What chance does to one hand: tremor, pauses and slips."""
+
+    def __init__(self, lapse: float, rng: np.random.Generator) -> None:
+        """Begin an episode.
+
+        Args:
+            lapse: what is lacking of full skill, in [0, 1].
+            rng: source of tremor, pauses and slips.
+        """
+        self._lapse = lapse
+        self._rng = rng
+        self._tremor: Array = np.zeros(3)
+        self._pause_left = 0
+        self._slip_left = 0
+        self._slip_intention: Array = np.zeros(4)
+
+    def disturb(self, intention: Array) -> Array:
+        """One step: what the hand (4,) does instead."""
+        intention = self._slip(self._pause(intention))
+        return intention + np.append(self._next_tremor(), 0.0)
+
+    def _next_tremor(self) -> Array:
+        """First-order autoregressive noise with a stationary standard deviation of `TREMOR` times the lapse."""
+        innovation = math.sqrt(1.0 - TREMOR_CORRELATION**2) * self._lapse * TREMOR
+        self._tremor = TREMOR_CORRELATION * self._tremor + innovation * self._rng.standard_normal(3)
+        return self._tremor
+
+    def _pause(self, intention: Array) -> Array:
+        """Stand still for a few steps now and then; the fingers do what they did."""
+        self._pause_left = self._next_count(self._pause_left, PAUSE_RATE, PAUSE_STEPS)
+        return np.append(np.zeros(3), intention[3]) if self._pause_left else intention
+
+    def _slip(self, intention: Array) -> Array:
+        """Move off in a random direction for a few steps now and then, the gripper doing the opposite."""
+        before = self._slip_left
+        self._slip_left = self._next_count(self._slip_left, SLIP_RATE, SLIP_STEPS)
+        if self._slip_left > before:  # a new one
+            direction = self._rng.standard_normal(3)
+            self._slip_intention = np.append(direction / np.linalg.norm(direction), -intention[3])
+        return self._slip_intention if self._slip_left else intention
+
+    def _next_count(self, left: int, rate: float, steps: tuple[int, int]) -> int:
+        """Steps left of a pause or slip: count down, or begin one with probability `rate` times the lapse."""
+        if left > 1:
+            return left - 1
+        if self._rng.random() < self._lapse * rate:
+            return int(self._rng.integers(steps[0], steps[1] + 1))
+        return 0
+
+
 class Operator:
     """An expert played with some skill, for one episode.
 
@@ -64,9 +115,9 @@ class Operator:
         """Begin an episode.
 
         Args:
-            expert: pure function from an observation to an action (4,) in [-1, 1]: x, y, z, gripper.
+            expert: whose intentions are carried out.
             skill: in [0, 1].
-            rng: source of tremor, pauses and slips.
+            rng: source of what is left to chance.
 
         Raises:
             ValueError: if the skill is outside [0, 1].
@@ -76,53 +127,18 @@ class Operator:
         self.expert = expert
         self.skill = skill
         self._rng = rng
-        self._tremor: Array = np.zeros(3)
-        self._pause_left = 0
-        self._slip_left = 0
-        self._slip_action: Array = np.zeros(4)
+        self._lapses: list[Lapses] = []  # one per hand
 
-    def __call__(self, observation: dict[str, np.ndarray]) -> np.ndarray:
-        """Act on one raw observation of a single environment.
-
-        Args:
-            observation: `agent_pos`, whose first three numbers are the hand's position, and `environment_state`.
-
-        Returns:
-            Action (4,) in [-1, 1], float32.
-        """
-        wanted = self.expert(observation)
+    def __call__(self, observation: Observation) -> np.ndarray:
+        """Action (A,), float32, on one raw observation of a single environment."""
         if self.skill == 1.0:
-            return wanted
-        hand = np.asarray(observation["agent_pos"][:3], dtype=np.float64)
-        action = bent_path(np.asarray(wanted, dtype=np.float64), hand, self.skill)
-        action = self._slip(self._pause(action))
-        action[:3] += self._next_tremor()
-        return np.clip(action, -1.0, 1.0).astype(np.float32)
-
-    def _next_tremor(self) -> Array:
-        """First-order autoregressive noise with a stationary standard deviation of `TREMOR` times the lapse."""
-        innovation = math.sqrt(1.0 - TREMOR_CORRELATION**2) * (1.0 - self.skill) * TREMOR
-        self._tremor = TREMOR_CORRELATION * self._tremor + innovation * self._rng.standard_normal(3)
-        return self._tremor
-
-    def _pause(self, action: Array) -> Array:
-        """Stand still for a few steps now and then; the fingers do what they did."""
-        self._pause_left = self._next_count(self._pause_left, PAUSE_RATE, PAUSE_STEPS)
-        return np.append(np.zeros(3), action[3]) if self._pause_left else action
-
-    def _slip(self, action: Array) -> Array:
-        """Move off in a random direction for a few steps now and then, the gripper doing the opposite."""
-        before = self._slip_left
-        self._slip_left = self._next_count(self._slip_left, SLIP_RATE, SLIP_STEPS)
-        if self._slip_left > before:  # a new one
-            direction = self._rng.standard_normal(3)
-            self._slip_action = np.append(direction / np.linalg.norm(direction), -action[3])
-        return self._slip_action.copy() if self._slip_left else action
-
-    def _next_count(self, left: int, rate: float, steps: tuple[int, int]) -> int:
-        """Steps left of a pause or slip: count down, or begin one with probability `rate` times the lapse."""
-        if left > 1:
-            return left - 1
-        if self._rng.random() < (1.0 - self.skill) * rate:
-            return int(self._rng.integers(steps[0], steps[1] + 1))
-        return 0
+            return self.expert(observation)
+        intentions = self.expert.intentions(observation)  # (H, 4)
+        hands = self.expert.hands(observation)  # (H, 3)
+        while len(self._lapses) < len(intentions):
+            self._lapses.append(Lapses(1.0 - self.skill, self._rng))
+        disturbed = [
+            lapses.disturb(bent_path(intention, hand, self.skill))
+            for lapses, intention, hand in zip(self._lapses, intentions, hands, strict=True)
+        ]
+        return self.expert.act(observation, np.clip(disturbed, -1.0, 1.0))

@@ -5,16 +5,12 @@ the demonstrations sees everything that its expert saw. Stages blend into each o
 centimetres instead of switching, so that actions change smoothly.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE
-
-Array = NDArray[np.float64]
-Expert = Callable[[dict[str, np.ndarray]], np.ndarray]
+from lerobot_agpd.envs.experts.base import Array, Expert, ramp
 
 # Action units per metre of position error. An action of 1 asks for 5 cm in one step; the arm follows with a lag.
 POSITION_GAIN = 10.0
@@ -70,11 +66,6 @@ def _state_vectors(observation: dict[str, np.ndarray], environment_dim: int) -> 
     return agent, scene
 
 
-def _ramp(value: float, zero_at: float, one_at: float) -> float:
-    """Rise linearly from 0 at `zero_at` to 1 at `one_at` (or fall, if `one_at` is the smaller), clipped."""
-    return float(np.clip((value - zero_at) / (one_at - zero_at), 0.0, 1.0))
-
-
 def _action(displacement: Array, gripper: float) -> np.ndarray:
     """Proportional action (4,) in [-1, 1], float32, for a wanted displacement (3,) in metres."""
     return np.clip(np.append(POSITION_GAIN * displacement, gripper), -1.0, 1.0).astype(np.float32)
@@ -108,12 +99,12 @@ def fetch_pick_and_place_expert(observation: dict[str, np.ndarray]) -> np.ndarra
     """
     scene = FetchScene.from_observation(observation)
     to_block = scene.block - scene.grip
-    between_fingers = _ramp(float(np.linalg.norm(to_block)), zero_at=0.035, one_at=0.020)
-    held = between_fingers * _ramp(scene.width, zero_at=0.058, one_at=0.052)
+    between_fingers = ramp(float(np.linalg.norm(to_block)), zero_at=0.035, one_at=0.020)
+    held = between_fingers * ramp(scene.width, zero_at=0.058, one_at=0.052)
 
     sideways = float(np.linalg.norm(to_block[:2]))
-    fingers_shut = (1.0 - between_fingers) * _ramp(scene.width, zero_at=0.09, one_at=0.07)
-    clearance = GRASP_CLEARANCE * max(_ramp(sideways, zero_at=0.008, one_at=0.05), fingers_shut)
+    fingers_shut = (1.0 - between_fingers) * ramp(scene.width, zero_at=0.09, one_at=0.07)
+    clearance = GRASP_CLEARANCE * max(ramp(sideways, zero_at=0.008, one_at=0.05), fingers_shut)
     approach = to_block + np.array([0.0, 0.0, clearance])
     carry = scene.goal - scene.block
     gripper = OPEN + (CLOSE - OPEN) * between_fingers
@@ -142,44 +133,26 @@ def fetch_push_expert(observation: dict[str, np.ndarray]) -> np.ndarray:
     above = float(scene.grip[2] - scene.block[2])
 
     # A hand in the air needs more room to come down than a lowered hand, in contact, needs to stay down.
-    room = 0.03 + 0.025 * _ramp(above, zero_at=0.02, one_at=0.05)
-    is_behind = _ramp(behind, zero_at=room - 0.01, one_at=room)
-    in_line = is_behind * _ramp(float(np.linalg.norm(sideways)), zero_at=0.03, one_at=0.015)
-    pushing = in_line * _ramp(above, zero_at=0.03, one_at=0.015)
+    room = 0.03 + 0.025 * ramp(above, zero_at=0.02, one_at=0.05)
+    is_behind = ramp(behind, zero_at=room - 0.01, one_at=room)
+    in_line = is_behind * ramp(float(np.linalg.norm(sideways)), zero_at=0.03, one_at=0.015)
+    pushing = in_line * ramp(above, zero_at=0.03, one_at=0.015)
     # Close to the block and still low, rise before moving on: otherwise the hand drags the block along.
     may_travel = max(
-        _ramp(float(np.linalg.norm(from_block)), zero_at=0.07, one_at=0.11),
-        _ramp(above, zero_at=0.03, one_at=0.06),
+        ramp(float(np.linalg.norm(from_block)), zero_at=0.07, one_at=0.11),
+        ramp(above, zero_at=0.03, one_at=0.06),
     )
 
     travel = -PUSH_STANDOFF * forward - from_block
     push = min(distance + behind - PUSH_CONTACT, PUSH_STRIDE) * forward - 2.0 * sideways
     horizontal = (1.0 - pushing) * may_travel * travel + pushing * push
     vertical = PUSH_CLEARANCE * (1.0 - in_line) - above
-    away_from_goal = _ramp(distance, zero_at=0.015, one_at=0.03)
+    away_from_goal = ramp(distance, zero_at=0.015, one_at=0.03)
     return _action(away_from_goal * np.append(horizontal, vertical), gripper=0.0)
 
 
 EXPERTS: dict[str, Expert] = {
-    "FetchReach-v4": fetch_reach_expert,
-    "FetchPush-v4": fetch_push_expert,
-    "FetchPickAndPlace-v4": fetch_pick_and_place_expert,
+    "FetchReach-v4": Expert(fetch_reach_expert),
+    "FetchPush-v4": Expert(fetch_push_expert),
+    "FetchPickAndPlace-v4": Expert(fetch_pick_and_place_expert),
 }
-
-
-def make_expert(task: str) -> Expert:
-    """Find the expert of a task.
-
-    Args:
-        task: a task of the `gymnasium_robotics` environment type.
-
-    Returns:
-        A pure function from the raw observation of a single environment (`agent_pos`, `environment_state`) to an
-        action in [-1, 1].
-
-    Raises:
-        ValueError: if the task has no expert.
-    """
-    if task not in EXPERTS:
-        raise ValueError(f"No scripted expert for {task!r}. Tasks with one: {', '.join(EXPERTS)}.")
-    return EXPERTS[task]
