@@ -131,5 +131,8 @@ def test_batched_observation_is_refused():
 
 
 def test_task_without_expert_is_refused():
-    with pytest.raises(ValueError, match="FetchSlide-v4 has no scripted expert.*FetchReach-v4, FetchPush-v4, FetchPickAndPlace-v4"):
+    with pytest.raises(
+        ValueError,
+        match="FetchSlide-v4 has no scripted expert.*FetchReach-v4, FetchPush-v4, FetchPickAndPlace-v4",
+    ):
         make_expert(GymnasiumRoboticsEnv(task="FetchSlide-v4"))

@@ -84,7 +84,7 @@ class SingleEnvConfig(ABC):
     # Of EnvConfig:
     type: str
     task: str | None
-    fps: int
+    fps: int | None
 
     @property
     @abstractmethod
