@@ -1,7 +1,7 @@
 """The matrix, its runs, what their folders say, and the report."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from lerobot_agpd.comparison.evaluations import RESULT, best_step, read_evaluati
 from lerobot_agpd.comparison.files import read_json, write_json
 from lerobot_agpd.comparison.matrix import flat, load_matrix
 from lerobot_agpd.comparison.results import compare, read_result
+from lerobot_agpd.comparison.rounds import HEADER, collection_rows
 from lerobot_agpd.comparison.runs import check, environment, expand, parse_flags
 from lerobot_agpd.comparison.table import difference_rows, method_row, report, training_time
 from lerobot_agpd.comparison.training import (
@@ -315,6 +316,20 @@ def store(run, matrix, best, last, curve=None, rounds=(), seconds=None, adopted=
     )
 
 
+def collected(guided, unguided, actions=None, states=None) -> dict:
+    """A round's report; generated, successful and kept episodes of both parts, none of them trivial."""
+    keys = ("generated", "successful", "kept")
+    parts = [dict(zip(keys, part, strict=True)) for part in (guided, unguided)]
+    return {
+        **{key: parts[0][key] + parts[1][key] for key in keys},
+        "guided": {"trivial": 0, **parts[0]},
+        "unguided": {"trivial": 0, **parts[1]},
+        "mean_shift_in_sigmas": 0.5,
+        "diagnostics": {"actions": actions, "states": states} if actions or states else None,
+        "seconds": {"teacher": 2.0, "environment": 1.0},
+    }
+
+
 @pytest.fixture
 def compared(tmp_path):
     """Two methods with two training seeds, a teacher, four environments; outcomes known."""
@@ -325,7 +340,7 @@ def compared(tmp_path):
     curve = {10: [1, 1], 20: [1, 0]}
     store(runs["pusht/bc/seed-1"], matrix, [1, 0, 0, 0], [0, 0, 0, 0], curve)
     store(runs["pusht/bc/seed-2"], matrix, [1, 1, 0, 0], [1, 0, 0, 0], {10: [0, 0], 20: [1, 1]})
-    round_ = {"generated": 10, "successful": 8, "kept": 7}
+    round_ = collected(guided=(6, 6, 5), unguided=(4, 2, 2))
     spent = {"total": 60.0, "teacher": 20.0, "environment": 10.0}
     store(runs["pusht/agpd/seed-1"], matrix, [1, 1, 1, 0], [1, 1, 0, 0], curve, [round_, round_], spent)
     store(runs["pusht/agpd/seed-2"], matrix, [1, 1, 1, 1], [1, 1, 1, 0], curve, [round_], spent, adopted=1)
@@ -363,6 +378,22 @@ def test_a_row_of_the_table(compared):
     assert row[10:] == ("1.50 M", "2.0")
     teacher = method_row("teacher", results["teacher"])
     assert (teacher[1], teacher[2], teacher[8], teacher[9]) == ("-", "-", "-", "-")
+
+
+def test_collection_rounds_are_pooled_and_averaged(compared):
+    _, results = compared
+    run = replace(
+        results["agpd"][0],
+        rounds=[
+            collected((8, 6, 6), (2, 1, 1), {"rms_to_teacher": 0.1}, {"entropy": -1.0, "coverage": None}),
+            collected((8, 2, 2), (0, 0, 0), {"rms_to_teacher": 0.3}, {"entropy": -2.0, "coverage": 0.5}),
+        ],
+    )
+    rows = collection_rows({"bc": results["bc"], "agpd": [run]})
+    assert rows == [
+        ("agpd", "0.50", "0.50", "0.50", "0.200", "-", "-", "-", "-1.50", "0.50", "3"),
+    ], "8 of 16 guided, 1 of 2 unguided; nothing of a method without rounds"
+    assert len(rows[0]) == len(HEADER)
 
 
 def test_the_report_says_what_is_missing_and_what_was_disturbed(compared):

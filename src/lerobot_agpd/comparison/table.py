@@ -9,6 +9,11 @@ import numpy as np
 from lerobot_agpd.analysis.statistics import mean, success_rate
 from lerobot_agpd.comparison.matrix import Matrix
 from lerobot_agpd.comparison.results import CHECKPOINTS, RunResult, compare, counts
+from lerobot_agpd.comparison.rounds import (
+    HEADER as COLLECTION_HEADER,
+    NOTE as COLLECTION_NOTE,
+    collection_rows,
+)
 
 Methods = Mapping[str, Sequence[RunResult]]
 """Method to its results, one per training seed."""
@@ -61,6 +66,9 @@ def report(matrix: Matrix, results: Mapping[str, Methods], missing: Sequence[str
             seed=entry.seed,
         )
         parts.append(notes.replace("\n", " ").rstrip())
+        if rows := collection_rows(methods):
+            parts.append(_markdown(COLLECTION_HEADER, rows))
+            parts.append(COLLECTION_NOTE.replace("\n", " ").rstrip())
     parts += _remarks(matrix, results, missing)
     return "\n\n".join(parts) + "\n"
 
