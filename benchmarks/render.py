@@ -1,16 +1,24 @@
-"""Write docs/results/*.md and the README's tables from the committed results in benchmarks/*/report.json.
+"""Write docs/results/*.md and the README's tables from the committed results: benchmarks/*/report.json,
+benchmarks/latency/latency-*.json and benchmarks/comparison/results/<task>/<method>/<seed>/run.json.
 
 usage: python benchmarks/render.py          (python benchmarks/render.py --check fails if a page is out of date)
 """
 
 import json
+import os
 import re
 import sys
 from pathlib import Path
 
 from lerobot_agpd.analysis.report import MethodResult, markdown
+from lerobot_agpd.comparison.curves import draw_curves
+from lerobot_agpd.comparison.matrix import load_matrix
+from lerobot_agpd.comparison.results import RunResult, read_result
+from lerobot_agpd.comparison.runs import expand
+from lerobot_agpd.comparison.table import report
 
 ROOT = Path(__file__).parent.parent
+COMPARISON = ROOT / "benchmarks" / "comparison"
 COLUMNS = ("round", "scale", "guided", "unguided", "generated", "kept", "shift in sigmas", "seconds")
 
 
@@ -74,6 +82,37 @@ def latency_page(path: Path) -> str:
     return f"{(path.parent / 'README.md').read_text().rstrip()}\n\n{where}\n\n{table}\n"
 
 
+def comparison_page(path: Path, draw: bool) -> str | None:
+    """The page of one matrix; None if nothing of it is committed. Its learning curves are drawn beside the results."""
+    intro = COMPARISON / f"{path.stem}.md"
+    if not intro.exists():
+        return None
+    runs_folder = json.loads((COMPARISON / "results" / "runs_folders.json").read_text())[path.stem]
+    os.environ["AGPD_RUNS"] = runs_folder  # where the runs were made: it is part of their flags
+    matrix = load_matrix(path)
+    matrix.output = COMPARISON / "results"
+    found: dict[str, dict[str, list[RunResult]]] = {}
+    missing = []
+    for run in expand(matrix):
+        result = read_result(run, matrix)
+        if result is not None:
+            found.setdefault(run.task, {}).setdefault(run.method, []).append(result)
+        elif run.folder.parent.exists():  # a method that was begun; the others are not part of the page
+            missing.append(run.name)
+    order = list(matrix.methods)
+    found = {
+        task: {name: methods[name] for name in order if name in methods} for task, methods in found.items()
+    }
+    parts = [intro.read_text().rstrip(), report(matrix, found, missing).rstrip()]
+    for task, methods in found.items():
+        picture = matrix.output / f"curves-{task}.png"
+        if draw:
+            entry = matrix.tasks[task]
+            draw_curves(methods, entry.measure, entry.title or task, picture)
+        parts.append(f"![learning curves](../../{picture.relative_to(ROOT)})")
+    return "\n\n".join(parts) + "\n"
+
+
 def readme(text: str, folder: Path) -> str:
     table = markdown(results(folder)).rstrip()
     pattern = re.compile(rf"(<!-- {folder.name}-results -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -87,6 +126,10 @@ def main() -> None:
         pages[ROOT / "README.md"] = readme(pages[ROOT / "README.md"], folder)
     for path in sorted((ROOT / "benchmarks" / "latency").glob("latency-*.json")):
         pages[ROOT / "docs" / "results" / f"{path.stem}.md"] = latency_page(path)
+    for path in sorted(COMPARISON.glob("*.yaml")):
+        content = comparison_page(path, draw="--check" not in sys.argv)
+        if content is not None:
+            pages[ROOT / "docs" / "results" / f"comparison-{path.stem}.md"] = content
     stale = [path for path, text in pages.items() if not path.exists() or path.read_text() != text]
     if "--check" in sys.argv:
         sys.exit(f"out of date, run benchmarks/render.py: {[str(p) for p in stale]}" if stale else 0)
