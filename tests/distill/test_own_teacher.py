@@ -73,9 +73,9 @@ def test_its_teacher_speaks_the_students_units(student, demonstrations):
 
 def test_the_adversary_compares_with_executed_chunks_of_collected_rows(student, loop_batch):
     with declared_run(RunInfo()):
-        student.config.collect = CollectConfig(every=0)
-        student.config.adversary = AdversaryConfig(start=0)
+        student.config.collect, student.config.adversary = CollectConfig(every=0), AdversaryConfig(weight=0)
         distillation = student.distillation
+        student.config.adversary = AdversaryConfig(start=0)
         rows = distillation.training_rows(loop_batch(student.config, [0, 1, 6]))
         assert distillation._adversarial_loss(rows) == (0.0, {}), "demonstrations alone are not compared with"
         rows["agpd.row"] = torch.tensor([0, 13, 14])  # as if the last two were collected
@@ -84,6 +84,12 @@ def test_the_adversary_compares_with_executed_chunks_of_collected_rows(student, 
         assert torch.equal(compared, ~rows["action_is_pad"][1:, 1:])
         loss, log = distillation._adversarial_loss(rows)
     assert loss.requires_grad and "discriminator_accuracy" in log
+
+
+def test_an_adversary_without_anything_to_compare_with_is_refused(student):
+    student.config.collect = CollectConfig(every=0)
+    with declared_run(RunInfo()), pytest.raises(ValueError, match="adversary.weight=0.05 needs collected"):
+        student.distillation  # noqa: B018
 
 
 def test_an_act_student_cannot_teach_itself(agpd_config):

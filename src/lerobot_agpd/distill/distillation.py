@@ -112,6 +112,12 @@ class Distillation:
                 f"--policy.replay.relabel={self.config.replay.relabel} needs a teacher (--policy.teacher.path); in "
                 "self-distillation the only one is the student"
             )
+        if self.config.adversary.weight > 0 and not self.config.collect.enabled:
+            raise ValueError(
+                f"--policy.adversary.weight={self.config.adversary.weight} needs collected episodes: in "
+                "self-distillation the adversary compares with them, and no round is to be collected; set it to 0, or "
+                "--policy.collect.every above 0, or give a teacher (--policy.teacher.path)"
+            )
         own_teacher = OwnTeacher(self.student)
         if self.state.checkpoint is not None:
             own_teacher.restore(Path(self.state.checkpoint))
