@@ -16,11 +16,11 @@ quickstart: setup  ## distil a teacher on FetchPickAndPlace, offline, in a few m
 	@PATH="$(CURDIR)/.venv/bin:$$PATH" bash examples/quickstart.sh
 
 test: setup  ## all tests, fast ones first
-	@OMP_NUM_THREADS=1 $(RUN) pytest -m "not slow"
-	@OMP_NUM_THREADS=1 $(RUN) pytest -m slow
+	@OMP_NUM_THREADS=1 $(RUN) pytest -m "not slow" -n auto --dist loadfile
+	@OMP_NUM_THREADS=1 $(RUN) pytest -m slow -n auto --dist worksteal
 
 test-fast: setup  ## tests without the end-to-end runs
-	@OMP_NUM_THREADS=1 $(RUN) pytest -m "not slow"
+	@OMP_NUM_THREADS=1 $(RUN) pytest -m "not slow" -n auto --dist loadfile
 
 lint: setup  ## ruff and mypy
 	@$(RUN) ruff check . && $(RUN) ruff format --check . && $(RUN) mypy
