@@ -4,6 +4,7 @@ import multiprocessing
 
 import lerobot_agpd.envs.aloha
 import lerobot_agpd.envs.gymnasium_robotics
+import lerobot_agpd.envs.robomimic
 import lerobot_agpd.policies.act_diffusion.configuration_act_diffusion
 import lerobot_agpd.policies.agpd.configuration_agpd
 import lerobot_agpd.policies.agpd_diffusion.configuration_agpd_diffusion

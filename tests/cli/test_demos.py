@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.envs.configs import EnvConfig
+from lerobot.envs.configs import EnvConfig, PushtEnv
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_agpd.cli import demos
@@ -14,6 +14,7 @@ from lerobot_agpd.cli.demos import DemosConfig, DemosReport, record_demos, succe
 from lerobot_agpd.envs.experts.base import Expert
 from lerobot_agpd.envs.experts.fetch import fetch_reach_expert
 from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
+from lerobot_agpd.envs.robomimic import RobomimicEnvConfig
 from lerobot_agpd.envs.robotics_tasks import TASKS
 
 pytest.importorskip("gymnasium_robotics")
@@ -150,9 +151,20 @@ def test_images_are_recorded_where_they_are_observed(tmp_path):
 def test_report_counts_per_skill():
     report = DemosReport(task=REACH, seeds=[0, 1, 2], skills=[1.0, 0.5, 1.0])
     report.failed_seeds, report.failed_skills = [3, 4, 5], [0.5, 0.5, 0.5]
-    assert (report.success_rate_of(1.0), report.success_rate_of(0.5)) == (1.0, 0.25)
+    assert (report.success_rate(1.0).mean, report.success_rate(0.5).mean) == (1.0, 0.25)
     cells = [cell for column in report.to_table().columns for cell in column.cells]
-    assert "0.250 (1 recorded, 3 failed)" in cells
+    assert (
+        "0.25 [0.05, 0.70], N = 4" in cells
+    )  # Wilson, by hand: (1 + z^2 / 2 -+ z sqrt(3 / 4 + z^2 / 4)) / (4 + z^2)
+
+
+def test_rates_leave_trivial_starts_out_or_count_them():
+    report = DemosReport(task=REACH, seeds=[0, 1, 2], trivial_seeds=[3, 4], failed_seeds=[5])
+    assert (report.success_rate().mean, report.success_rate().n) == (0.75, 4)
+    assert (report.recorded_share.mean, report.recorded_share.n) == (0.5, 6)
+    cells = [cell for column in report.to_table().columns for cell in column.cells]
+    assert cells.count("0.75 [0.30, 0.95], N = 4") == 1
+    assert cells.count("0.50 [0.19, 0.81], N = 6") == 1
 
 
 def test_trivial_starts_and_failures_are_left_out_and_counted(tmp_path):
@@ -174,7 +186,7 @@ def test_trivial_starts_and_failures_are_left_out_and_counted(tmp_path):
     assert report.trivial_seeds == [seed for seed in trivial if seed <= report.seeds[-1]]
     assert report.failed_seeds == [next(seed for seed in range(60) if seed not in trivial)]
     assert sorted(report.seeds + report.trivial_seeds + report.failed_seeds) == list(range(report.attempts))
-    assert report.success_rate == pytest.approx(40 / 41)
+    assert report.success_rate().mean == pytest.approx(40 / 41)
 
 
 def test_an_expert_that_never_succeeds_ends_in_an_error_and_leaves_no_dataset(tmp_path, monkeypatch):
@@ -191,6 +203,18 @@ def test_leftovers_of_an_interrupted_run_are_replaced(tmp_path):
     record_demos(reach_config(tmp_path / "x", episodes=1))
     assert not leftover.exists() and not (tmp_path / "x" / "meta" / "old.json").exists()
     assert LeRobotDataset("local/demos", root=tmp_path / "x").num_episodes == 1
+
+
+@pytest.mark.parametrize(
+    ("env", "command"),
+    [
+        (PushtEnv(), "lerobot-agpd-import-pusht"),
+        (RobomimicEnvConfig(task="square"), "lerobot-agpd-import-robomimic"),
+    ],
+)
+def test_tasks_without_expert_name_the_way_to_peoples_demonstrations(tmp_path, env, command):
+    with pytest.raises(ValueError, match=f"no scripted expert.* {command} imports people's demonstrations"):
+        DemosConfig(root=tmp_path / "x", env=env)
 
 
 def test_existing_root_is_refused(tmp_path):

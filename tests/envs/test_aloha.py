@@ -126,6 +126,19 @@ def test_images_come_from_the_chosen_cameras_in_the_chosen_size(rendering):
     env.close()
 
 
+@pytest.mark.parametrize("obs_type", ["environment_state_agent_pos", "pixels"])
+def test_the_state_is_at_hand_whatever_is_observed(rendering, obs_type):
+    env = AlohaStateEnvConfig(obs_type=obs_type, **SMALL).make_single()
+    env.reset(seed=3)
+    env.step(START)
+    state = env.get_wrapper_attr("state")
+    qpos = env.unwrapped._env.physics.data.qpos
+    np.testing.assert_allclose(state[ENVIRONMENT_STATE], qpos[16:], rtol=1e-6)
+    np.testing.assert_allclose(state[AGENT_POS][:6], qpos[:6], atol=1e-6)
+    assert env.get_wrapper_attr("task_description").startswith("Pick up the cube")
+    env.close()
+
+
 def test_the_cameras_are_the_models():
     model = AlohaStateEnvConfig().make_single().unwrapped._env.physics.model
     assert set(CAMERAS) == {model.id2name(camera, "camera") for camera in range(model.ncam)}

@@ -21,6 +21,7 @@ from lerobot.configs import FeatureType
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import DONE, REWARD, SUCCESS
+from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -206,6 +207,7 @@ def run(config: DemosConfig) -> None:
 def main() -> None:
     """Console entry point."""
     init_logging()
+    register_third_party_plugins()
     disable_progress_bars()  # one bar of the datasets library per episode would tear ours apart
     run()
 

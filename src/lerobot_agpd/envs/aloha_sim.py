@@ -67,6 +67,8 @@ class AlohaStateEnv(AlohaEnv):
             kwargs: gym_aloha's own (image sizes, render mode).
         """
         super().__init__(task, obs_type="+".join(keys), **kwargs)
+        self.state: dict[str, np.ndarray] = {}
+        """`agent_pos` and `environment_state` of the last observation, whatever `keys` are: for scripted experts."""
         self.keys = keys
         self.cameras = cameras
         self.shadows = shadows
@@ -97,9 +99,8 @@ class AlohaStateEnv(AlohaEnv):
         return control.Environment(physics, task_class(), time_limit=float("inf"), control_timestep=DT)
 
     def _format_raw_obs(self, raw_obs: dict[str, np.ndarray]) -> dict[str, Any]:
-        observation: dict[str, Any] = {
-            key: raw_obs[key].astype(np.float32) for key in self.keys if key != PIXELS
-        }
+        self.state = {key: raw_obs[key].astype(np.float32) for key in (AGENT_POS, ENVIRONMENT_STATE)}
+        observation: dict[str, Any] = {key: self.state[key] for key in self.keys if key != PIXELS}
         if PIXELS in self.keys:
             size = (self.observation_height, self.observation_width)
             observation[PIXELS] = {camera: self._image(camera, size) for camera in self.cameras}

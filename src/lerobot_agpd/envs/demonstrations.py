@@ -7,8 +7,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from lerobot.utils.constants import ACTION, DONE, REWARD, SUCCESS
+from lerobot.utils.utils import flatten_dict
 from rich.table import Table
 
+from lerobot_agpd.analysis.statistics import Estimate, success_rate
 from lerobot_agpd.envs.experts.base import Observation
 
 Frame = dict[str, Any]
@@ -42,15 +44,29 @@ class DemosReport:
         return len(self.seeds) + len(self.trivial_seeds) + len(self.failed_seeds)
 
     @property
-    def success_rate(self) -> float:
-        """Share of episodes with the goal reached at the last step, without trivial starts; nan if there are none."""
-        played = len(self.seeds) + len(self.failed_seeds)
-        return len(self.seeds) / played if played else float("nan")
+    def operators(self) -> list[float]:
+        """Skills that were played, the best first."""
+        return sorted({*self.skills, *self.failed_skills}, reverse=True)
 
-    def success_rate_of(self, skill: float) -> float:
-        """Share of an operator's episodes, without trivial starts, with the goal reached at the last step."""
-        succeeded, failed = self.skills.count(skill), self.failed_skills.count(skill)
-        return succeeded / (succeeded + failed) if succeeded + failed else float("nan")
+    def success_rate(self, skill: float | None = None) -> Estimate:
+        """Share of episodes with the goal reached at the last step, without trivial starts, with Wilson's interval.
+
+        Episodes are played until enough succeed, so the last one always does; over few episodes that flatters.
+
+        Args:
+            skill: of the operator whose episodes count; all by default.
+
+        Raises:
+            ValueError: if no such episode was played.
+        """
+        if skill is None:
+            return _share(len(self.seeds), len(self.failed_seeds))
+        return _share(self.skills.count(skill), self.failed_skills.count(skill))
+
+    @property
+    def recorded_share(self) -> Estimate:
+        """Recorded episodes per attempt, trivial starts included, with Wilson's interval."""
+        return _share(len(self.seeds), self.attempts - len(self.seeds))
 
     def to_table(self) -> Table:
         """Lay the counts out for the console."""
@@ -60,13 +76,20 @@ class DemosReport:
         table.add_row("dropped: failed", str(len(self.failed_seeds)))
         table.add_row("recorded episodes", str(len(self.seeds)))
         table.add_row("recorded frames", str(self.frames))
-        table.add_row("success rate without trivial starts", f"{self.success_rate:.3f}")
-        operators = sorted({*self.skills, *self.failed_skills}, reverse=True)
-        if operators != [1.0]:
-            for skill in operators:
-                counts = f"{self.skills.count(skill)} recorded, {self.failed_skills.count(skill)} failed"
-                table.add_row(f"  skill {skill:g}", f"{self.success_rate_of(skill):.3f} ({counts})")
+        table.add_row("recorded per attempt", _with_count(self.recorded_share))
+        table.add_row("success rate without trivial starts", _with_count(self.success_rate()))
+        for skill in self.operators if self.operators != [1.0] else []:
+            table.add_row(f"  skill {skill:g}", _with_count(self.success_rate(skill)))
         return table
+
+
+def _share(successes: int, failures: int) -> Estimate:
+    return success_rate([True] * successes + [False] * failures)
+
+
+def _with_count(estimate: Estimate) -> str:
+    """E.g. `0.91 [0.86, 0.94], N = 120`."""
+    return f"{estimate}, N = {estimate.n}"
 
 
 def play_episode(
@@ -90,7 +113,7 @@ def play_episode(
     done = False
     while not done:
         action = expert(env.get_wrapper_attr("state"))
-        frame = {features_map[key]: value for key, value in observation.items()}
+        frame = {features_map[key]: value for key, value in flatten_dict(observation).items()}
         observation, reward, terminated, truncated, info = env.step(action)
         done = terminated or truncated
         frame[ACTION] = action

@@ -4,11 +4,18 @@ from collections.abc import Mapping
 
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_agpd.envs.experts import fetch
+from lerobot_agpd.envs.experts import aloha, fetch, robomimic
 from lerobot_agpd.envs.experts.base import Expert
 
-EXPERTS: Mapping[str, Mapping[str, Expert]] = {"gymnasium_robotics": fetch.EXPERTS}
+EXPERTS: Mapping[str, Mapping[str, Expert]] = {
+    "gymnasium_robotics": fetch.EXPERTS,
+    "aloha_state": aloha.EXPERTS,
+    "robomimic": robomimic.EXPERTS,
+}
 """Environment type (`--env.type`) and task (`--env.task`) to expert."""
+
+IMPORT_COMMANDS = {"pusht": "lerobot-agpd-import-pusht", "robomimic": "lerobot-agpd-import-robomimic"}
+"""Environment type to the command that makes a dataset of people's demonstrations."""
 
 
 def make_expert(env: EnvConfig) -> Expert:
@@ -22,15 +29,19 @@ def make_expert(env: EnvConfig) -> Expert:
         action.
 
     Raises:
-        ValueError: if the type or the task has no expert.
+        ValueError: if the type or the task has no expert; it names the command that imports people's
+            demonstrations, if there is one.
     """
+    command = IMPORT_COMMANDS.get(env.type)
+    instead = f" {command} imports people's demonstrations." if command else ""
     tasks = EXPERTS.get(env.type)
     if tasks is None:
         raise ValueError(
-            f"--env.type={env.type} has no scripted experts. Types with some: {', '.join(EXPERTS)}."
+            f"--env.type={env.type} has no scripted experts. Types with some: {', '.join(EXPERTS)}.{instead}"
         )
     if env.task not in tasks:
         raise ValueError(
-            f"--env.task={env.task} has no scripted expert. Tasks of {env.type} with one: {', '.join(tasks)}."
+            f"--env.task={env.task} has no scripted expert. Tasks of {env.type} with one: "
+            f"{', '.join(tasks)}.{instead}"
         )
     return tasks[env.task]

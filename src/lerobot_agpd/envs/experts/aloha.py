@@ -1,0 +1,220 @@
+"""A scripted expert for ALOHA's cube transfer: a pure function of one observation.
+
+The right hand picks the cube up and holds it out, the left hand takes it, the right one lets go and draws
+back. Nothing is remembered between steps: who does what follows from where hands, fingers and cube are. A cube
+that falls is picked up again. Fingers cross at the cube: the right hand points down at an angle and closes
+sideways, the left one lies flat and closes from above and below.
+
+gym_aloha ends an episode as soon as the left hand's upper finger touches a cube that is off the table, before
+the right hand lets go.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE
+from lerobot_agpd.envs.experts.aloha_kinematics import HandPoses, arm_kinematics, rotation_vectors
+from lerobot_agpd.envs.experts.aloha_servos import position_servos
+from lerobot_agpd.envs.experts.base import Array, Expert, Observation, ramp
+
+ARM_JOINTS = np.array(
+    [range(6), range(7, 13)]
+)  # (2, 6), places among the 14 numbers of `agent_pos` and of an action
+GRIPPERS = np.array([6, 13])  # (2,)
+
+# An intention of 1 moves the hand this far in one step of 20 ms along an axis, metres.
+STRIDE = 0.006
+# Share of a position error that a hand makes up in one step, when it is not limited by the stride.
+POSITION_GAIN = 0.3
+# Fastest turn of a hand, radians per step.
+MAX_TURN = 0.06
+
+OPEN, CLOSE = 1.0, -1.0  # of an intention; an action has 1 and 0
+
+# Where the cube changes hands, and where the left hand waits for it, seen from there, metres. Low, so that a
+# cube that is lost on the way is soon picked up again.
+MEETING_POINT = np.array([0.0, 0.5, 0.15])
+LEFT_STANDOFF = np.array([-0.1, 0.0, 0.0])
+# Height of the right hand above the cube before it comes down, and its way back after the transfer, metres.
+GRASP_CLEARANCE = 0.08
+RETREAT = 0.10
+
+# Fingers point along x and close along y of the hand's frame. The left hand is rolled by 90 degrees, the
+# right one, which faces it, lowered by 60.
+LEFT_ROTATION = Rotation.from_euler("X", 90, degrees=True)
+RIGHT_ROTATION = Rotation.from_euler("ZY", [180, 60], degrees=True)
+RIGHT_POINTS = RIGHT_ROTATION.as_matrix()[:, 0]
+
+
+@dataclass(frozen=True)
+class TransferScene:
+    """One observation of the transfer, by name. Positions (3,) in metres, world frame.
+
+    Attributes:
+        left: position of the left hand.
+        right: position of the right hand.
+        left_opening: of the left gripper, 0 closed, 1 open, 0.61 around the cube.
+        right_opening: of the right gripper.
+        cube: position of the cube's centre.
+        cube_heading: angle about the vertical of the cube's sides, radians, in [-pi/4, pi/4].
+    """
+
+    left: Array
+    right: Array
+    left_opening: float
+    right_opening: float
+    cube: Array
+    cube_heading: float
+
+    @classmethod
+    def from_observation(cls, observation: Observation) -> "TransferScene":
+        """Read `agent_pos` (14,) and `environment_state` (7,) of one environment.
+
+        Raises:
+            ValueError: if the shapes differ, for instance because the observation is batched.
+        """
+        left, right = hand_positions(observation)
+        openings = np.asarray(observation[AGENT_POS], dtype=np.float64)[GRIPPERS]
+        pose = np.asarray(observation[ENVIRONMENT_STATE], dtype=np.float64)
+        if pose.shape != (7,):
+            raise ValueError(f"Expected {ENVIRONMENT_STATE} (7,) of a single environment, got {pose.shape}.")
+        return cls(left, right, float(openings[0]), float(openings[1]), pose[:3], heading_of_sides(pose[3:]))
+
+    @property
+    def left_surrounds(self) -> float:
+        """How much the cube is between the left hand's fingers, in [0, 1]."""
+        return ramp(float(np.linalg.norm(self.cube - self.left)), zero_at=0.025, one_at=0.015)
+
+    @property
+    def right_surrounds(self) -> float:
+        """How much the cube is between the right hand's fingers, in [0, 1]."""
+        return ramp(float(np.linalg.norm(self.cube - self.right)), zero_at=0.025, one_at=0.015)
+
+    @property
+    def left_holds(self) -> float:
+        """How much the left hand has the cube, in [0, 1]."""
+        return self.left_surrounds * ramp(self.left_opening, zero_at=0.65, one_at=0.62)
+
+    @property
+    def right_holds(self) -> float:
+        """How much the right hand has the cube, in [0, 1]."""
+        return self.right_surrounds * ramp(self.right_opening, zero_at=0.65, one_at=0.62)
+
+
+def heading_of_sides(quaternion: Array) -> float:
+    """Angle about the vertical, in [-pi/4, pi/4], that aligns a hand with the cube's sides.
+
+    Args:
+        quaternion: (4,) of the cube, w first. Which side is up does not matter.
+    """
+    axes = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()[
+        :2
+    ]  # (2, 3), columns seen from above
+    x, y = axes[:, np.argmax(np.linalg.norm(axes, axis=0))]  # the most horizontal one
+    return float((np.arctan2(y, x) + np.pi / 4) % (np.pi / 2) - np.pi / 4)
+
+
+def hand_rotations(scene: TransferScene) -> Array:
+    """How the hands (2, 3, 3) shall be turned.
+
+    The left one is always turned alike. The right one follows the sides of the cube until it has it, and then
+    faces the left one: from aside its fingers would be in the left one's way.
+    """
+    right = Rotation.from_euler("Z", (1.0 - scene.right_holds) * scene.cube_heading) * RIGHT_ROTATION
+    return np.stack([LEFT_ROTATION.as_matrix(), right.as_matrix()])
+
+
+def _arm_joints(observation: Observation) -> Array:
+    """Joint positions (2, 6), radians, left arm first."""
+    agent = np.asarray(observation[AGENT_POS], dtype=np.float64)
+    if agent.shape != (14,):
+        raise ValueError(f"Expected {AGENT_POS} (14,) of a single environment, got {agent.shape}.")
+    return agent[ARM_JOINTS]
+
+
+def hand_positions(observation: Observation) -> Array:
+    """Positions (2, 3) of the hands, metres, left first.
+
+    Raises:
+        ValueError: if `agent_pos` is not (14,).
+    """
+    return arm_kinematics().forward(_arm_joints(observation)).positions
+
+
+def _intention(displacement: Array, closing: float) -> Array:
+    """Intention (4,) for a displacement (3,) in metres, its direction kept, and fingers closing in [0, 1]."""
+    motion = POSITION_GAIN * displacement / STRIDE
+    return np.append(motion / max(1.0, float(np.abs(motion).max())), OPEN + (CLOSE - OPEN) * closing)
+
+
+def intend_transfer(observation: Observation) -> Array:
+    """What the two hands shall do, stages blending into each other.
+
+    Args:
+        observation: `agent_pos` (14,), `environment_state` (7,).
+
+    Returns:
+        (2, 4), left hand first: displacement in units of `STRIDE`, in [-1, 1]; gripper, -1 closed, 1 open.
+
+    Raises:
+        ValueError: if the observation has other shapes.
+    """
+    scene = TransferScene.from_observation(observation)
+    left = _intention(_left_displacement(scene), closing=scene.left_surrounds)
+    right = _intention(_right_displacement(scene), closing=scene.right_surrounds * (1.0 - scene.left_holds))
+    return np.stack([left, right])
+
+
+def _right_displacement(scene: TransferScene) -> Array:
+    """Come down onto the cube in a funnel, take it to the meeting point; draw back once the left has it."""
+    to_cube = scene.cube - scene.right
+    sideways = float(np.linalg.norm(to_cube[:2]))
+    fingers_shut = (1.0 - scene.right_surrounds) * ramp(scene.right_opening, zero_at=0.95, one_at=0.8)
+    clearance = GRASP_CLEARANCE * max(ramp(sideways, zero_at=0.008, one_at=0.05), fingers_shut)
+    descend = to_cube + np.array([0.0, 0.0, clearance])
+    pick_up = (1.0 - scene.right_holds) * descend + scene.right_holds * (MEETING_POINT - scene.cube)
+    draw_back = to_cube - RETREAT * RIGHT_POINTS
+    return (1.0 - scene.left_holds) * pick_up + scene.left_holds * draw_back
+
+
+def _left_displacement(scene: TransferScene) -> Array:
+    """Wait beside the meeting point, take the cube once it is held out there, and stay."""
+    to_meeting_point = MEETING_POINT - scene.cube
+    held_out = ramp(float(np.linalg.norm(to_meeting_point)), zero_at=0.03, one_at=0.015)
+    wait = MEETING_POINT + LEFT_STANDOFF - scene.left
+    take = held_out * (scene.cube - scene.left) + (1.0 - held_out) * wait
+    return (1.0 - scene.left_holds) * take + scene.left_holds * to_meeting_point
+
+
+def joint_targets(observation: Observation, intention: Array) -> np.ndarray:
+    """Carry out what the hands shall do, turning them toward `hand_rotations` on the way.
+
+    Args:
+        observation: `agent_pos` (14,), `environment_state` (7,).
+        intention: (2, 4), as `intend_transfer` gives it.
+
+    Returns:
+        Action (14,), float32: joint targets, radians, each arm's followed by its gripper's in [0, 1].
+    """
+    arms = arm_kinematics()
+    scene = TransferScene.from_observation(observation)
+    joints = _arm_joints(observation)
+    now = arms.forward(joints)
+    turn = rotation_vectors(now, HandPoses(now.positions, hand_rotations(scene)))  # (2, 3)
+    angle = np.linalg.norm(turn, axis=1, keepdims=True)
+    turn *= np.minimum(1.0, MAX_TURN / np.maximum(angle, MAX_TURN))
+    goal = HandPoses(
+        positions=now.positions + STRIDE * intention[:, :3],
+        rotations=Rotation.from_rotvec(turn).as_matrix() @ now.rotations,
+    )
+    action = np.empty(14, dtype=np.float32)
+    action[ARM_JOINTS] = position_servos().targets(joints, arms.inverse(joints, goal) - joints)
+    action[GRIPPERS] = np.clip((intention[:, 3] - CLOSE) / (OPEN - CLOSE), 0.0, 1.0)
+    return action
+
+
+EXPERTS: dict[str, Expert] = {
+    "AlohaTransferCube-v0": Expert(intend_transfer, hands=hand_positions, act=joint_targets)
+}

@@ -1,0 +1,250 @@
+"""robomimic's tasks in robosuite 1.5, as gymnasium environments with LeRobot's raw keys.
+
+The controller is that of robomimic's datasets for robosuite 1.5 (`env_args` of their HDF5 files: composite `BASIC`,
+`OSC_POSE` with deltas in the world frame). Its values are those of robomimic's `docs/modules/environments.md`
+(v0.5.0), where `damping` and `control_delta` are 1.4.1's names for `damping_ratio` and `input_type`. The files say
+`lite_physics` false; true gives the same numbers, bit for bit, in less time.
+"""
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS, image_space, unbounded
+from lerobot_agpd.envs.robomimic_tasks import FPS, OBSERVED_KEYS, get_task
+from lerobot_agpd.envs.robosuite_cameras import SceneCameras
+
+# robosuite warns at import of optional packages and of a settings file that hardly anybody has. Its logger sets its
+# own level while it is imported, so a filter it is.
+logging.getLogger("robosuite_logs").addFilter(lambda record: record.levelno >= logging.ERROR)
+
+import robosuite  # noqa: E402
+
+ARM_CONTROLLER: dict[str, Any] = {
+    "type": "OSC_POSE",
+    "input_max": 1,
+    "input_min": -1,
+    "output_max": [0.05, 0.05, 0.05, 0.5, 0.5, 0.5],  # metres, radians
+    "output_min": [-0.05, -0.05, -0.05, -0.5, -0.5, -0.5],
+    "kp": 150,
+    "damping_ratio": 1,
+    "impedance_mode": "fixed",
+    "kp_limits": [0, 300],
+    "damping_ratio_limits": [0, 10],
+    "position_limits": None,
+    "orientation_limits": None,
+    "uncouple_pos_ori": True,
+    "input_type": "delta",
+    "input_ref_frame": "world",
+    "interpolation": None,
+    "ramp_ratio": 0.2,
+    "gripper": {"type": "GRIP"},
+}
+
+MODEL_SEED = 0
+"""robosuite draws what a model is made of, such as the size of lift's cube, when it is built: always the same here."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What is observed, and what images look like; sizes are (height, width) in pixels."""
+
+    obs_type: str = "state"
+    cameras: tuple[str, ...] = ()
+    observation_size: tuple[int, int] = (84, 84)
+    visualization_size: tuple[int, int] = (480, 480)
+
+
+@contextmanager
+def numpy_seeded(seed: int) -> Iterator[None]:
+    """Seed numpy's global generator, from which robosuite 1.5.1 draws, and put it back as it was."""
+    state = np.random.get_state()
+    np.random.seed(seed)
+    try:
+        yield
+    finally:
+        np.random.set_state(state)
+
+
+class RobosuiteEnv(gym.Env):
+    """One task of `robomimic_tasks.TASKS`.
+
+    Observations are those of the keys that `view.obs_type` asks for: `agent_pos` and `environment_state` as float32
+    vectors, `pixels` as one uint8 image (height, width, 3) per camera. An action holds 7 numbers in [-1, 1] per
+    robot, see `robomimic_tasks.ARM_ACTION_DIM`. The reward is 1 at success, at which the episode terminates, else 0.
+    `info["is_success"]` is a bool after every step and every reset.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
+
+    def __init__(self, task: str, view: View | None = None, render_mode: str = "rgb_array") -> None:
+        """Build the simulation; no graphics context is opened before the first image.
+
+        Args:
+            task: key of `TASKS`.
+            view: what to observe; the state by default.
+            render_mode: only `rgb_array`.
+
+        Raises:
+            ValueError: if the task is not known.
+        """
+        self.view = view or View()
+        self.spec_of_task = get_task(task)
+        self.task = task
+        self.task_description = self.spec_of_task.description
+        self.render_mode = render_mode
+        with numpy_seeded(MODEL_SEED):
+            self.simulation = self._build()
+        self.scene_cameras = SceneCameras()
+        self._has_foreign_model = False
+        spaces: dict[str, gym.Space] = {
+            AGENT_POS: unbounded(self.spec_of_task.agent_pos_dim),
+            ENVIRONMENT_STATE: unbounded(self.spec_of_task.environment_state_dim),
+            PIXELS: gym.spaces.Dict(
+                {camera: image_space(*self.view.observation_size) for camera in self.view.cameras}
+            ),
+        }
+        self.observation_space = gym.spaces.Dict({key: spaces[key] for key in self._keys})
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (self.spec_of_task.action_dim,), dtype=np.float32)
+        self.state: dict[str, np.ndarray] = {}
+        """`agent_pos` and `environment_state` of the last observation, whatever `view` shows: for scripted experts."""
+
+    def _build(self) -> Any:
+        controller = {"type": "BASIC", "body_parts": {"right": ARM_CONTROLLER}}
+        return robosuite.make(
+            self.spec_of_task.robosuite_name,
+            robots=["Panda"] * self.spec_of_task.n_robots,
+            controller_configs=[controller] * self.spec_of_task.n_robots,
+            control_freq=FPS,
+            reward_shaping=False,
+            ignore_done=True,
+            hard_reset=False,
+            lite_physics=True,
+            use_object_obs=True,
+            use_camera_obs=False,
+            has_renderer=False,
+            has_offscreen_renderer=False,
+            renderer="mujoco",
+        )
+
+    @property
+    def _keys(self) -> tuple[str, ...]:
+        return OBSERVED_KEYS[self.view.obs_type]
+
+    def _observe(self) -> dict[str, Any]:
+        """Read the sensors once, now; robosuite's own clock of them drifts.
+
+        A reading of can, square and tool_hang computes the relative pose from where the object was at the reading
+        before. So do robomimic's data, which were read once per control step: see `step`.
+        """
+        raw = self.simulation._get_observations(force_update=True)
+        self.state = {
+            AGENT_POS: np.concatenate([raw[key] for key in self.spec_of_task.agent_keys], dtype=np.float32),
+            ENVIRONMENT_STATE: raw["object-state"].astype(np.float32),
+        }
+        observation: dict[str, Any] = {key: value for key, value in self.state.items() if key in self._keys}
+        if PIXELS in self._keys:
+            observation[PIXELS] = {
+                camera: self.scene_cameras.render(self.simulation.sim, camera, self.view.observation_size)
+                for camera in self.view.cameras
+            }
+        return observation
+
+    @property
+    def is_success(self) -> bool:
+        """Whether the task is done in the current state, by robosuite's own check."""
+        return bool(self.simulation._check_success())
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Reset to a start that follows from the seed, or without one from the last seed."""
+        super().reset(seed=seed)
+        if self._has_foreign_model:
+            self._restore_model()
+        with numpy_seeded(int(self.np_random.integers(2**32))):
+            self.simulation.reset()
+        return self._begin()
+
+    def _begin(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Make the episode a function of the current positions and velocities alone.
+
+        The contact solver forgets where it last ended, the controllers what they saw while they were built, the
+        sensors where objects were before.
+        """
+        sim = self.simulation.sim
+        sim.data.qacc_warmstart[:] = 0.0
+        sim.forward()
+        for robot in self.simulation.robots:
+            resting_posture = sim.data.qpos[robot._ref_arm_joint_pos_indexes]
+            robot.part_controllers["right"].update_initial_joints(resting_posture)
+        self.simulation._update_observables(force=True)
+        return self._observe(), {"is_success": self.is_success}
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """One control step of 50 ms."""
+        last_reading = dict(self.simulation._obs_cache)
+        _, reward, _, _ = self.simulation.step(np.asarray(action, dtype=np.float64))
+        self.simulation._obs_cache.update(last_reading)  # forget readings within the step
+        success = self.is_success
+        return self._observe(), float(reward), success, False, {"is_success": success}
+
+    def get_state(self) -> np.ndarray:
+        """Return MuJoCo's state (1 + nq + nv,): time, positions, velocities; robomimic's HDF5 `states`."""
+        return np.asarray(self.simulation.sim.get_state().flatten())
+
+    def reset_to(
+        self, state: np.ndarray, model_xml: str | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Reset to a recorded state.
+
+        The first state of an episode, continued with the episode's actions, reproduces it. Later states do so only
+        nearly: the arm's resting posture, which its redundant joint is drawn to, is taken from `state`.
+
+        Args:
+            state: (1 + nq + nv,) of `get_state` or of robomimic's `states`.
+            model_xml: the model it was recorded with (HDF5: attribute `model_file` of a demonstration), which
+                lasts until the next `reset`; without it, the current one.
+
+        Returns:
+            Observation and info, as `reset` does.
+
+        Raises:
+            ValueError: if the state does not have the model's length.
+        """
+        if model_xml is not None:
+            self.scene_cameras.close()
+            self._has_foreign_model = True
+            self.simulation.reset_from_xml_string(self.simulation.edit_model_xml(model_xml))
+        expected = self.get_state().shape
+        if state.shape != expected:
+            raise ValueError(f"A state of {self.task} has the shape {expected}, got {state.shape}.")
+        self.simulation.deterministic_reset = True  # controllers and sensors, without drawing a start
+        self.simulation.reset()
+        self.simulation.deterministic_reset = False
+        self.simulation.sim.set_state_from_flattened(state)
+        return self._begin()
+
+    def _restore_model(self) -> None:
+        """Build the task's own model again, after one that `reset_to` loaded."""
+        self.scene_cameras.close()
+        self.simulation.hard_reset = True
+        with numpy_seeded(MODEL_SEED):
+            self.simulation.reset()
+        self.simulation.hard_reset = False
+        self._has_foreign_model = False
+
+    def render(self) -> np.ndarray:
+        """Frame of `view.visualization_size` from the first of robomimic's cameras for the task."""
+        camera = self.spec_of_task.cameras[0]
+        return self.scene_cameras.render(self.simulation.sim, camera, self.view.visualization_size)
+
+    def close(self) -> None:
+        """Free the graphics contexts and the simulation."""
+        self.scene_cameras.close()
+        self.simulation.close()
