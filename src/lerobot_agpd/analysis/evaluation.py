@@ -24,6 +24,40 @@ class Evaluation:
     seeds: list[int]
 
 
+class Environments:
+    """Environments side by side, built when first needed and kept: building some takes seconds.
+
+    Use it as a context; leaving closes them.
+    """
+
+    def __init__(self, config: EnvConfig, n_envs: int):
+        """Remember what to build.
+
+        Args:
+            config: the environment.
+            n_envs: how many are stepped side by side.
+        """
+        self.config = config
+        self.n_envs = n_envs
+        self._suites: dict[str, dict[int, Any]] = {}
+
+    @property
+    def vectors(self) -> list[Any]:
+        """One vector environment per task."""
+        if not self._suites:
+            self._suites = make_env(self.config, n_envs=self.n_envs, use_async_envs=False)
+        return [envs for suite in self._suites.values() for envs in suite.values()]
+
+    def __enter__(self) -> Environments:
+        """Nothing is built yet."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close what was built."""
+        close_envs(self._suites)
+        self._suites = {}
+
+
 class Checkpoint:
     """A policy with its processors, ready to act."""
 
@@ -40,29 +74,22 @@ class Checkpoint:
             preprocessor_overrides={"device_processor": {"device": device}},
         )
 
-    def evaluate(
-        self, env_config: EnvConfig, n_episodes: int, batch_size: int, start_seed: int
-    ) -> Evaluation:
+    def evaluate(self, environments: Environments, n_episodes: int, start_seed: int) -> Evaluation:
         """Roll out n_episodes from consecutive seeds, as `lerobot-eval` does."""
-        tasks = make_env(env_config, n_envs=min(batch_size, n_episodes), use_async_envs=False)
-        processors = make_env_pre_post_processors(env_config, self.config)
+        processors = make_env_pre_post_processors(environments.config, self.config)
         episodes: list[dict[str, Any]] = []
-        try:
-            for suite in tasks.values():
-                for envs in suite.values():
-                    with torch.no_grad():
-                        info = eval_policy(
-                            envs,
-                            self.policy,
-                            *processors,
-                            self.preprocessor,
-                            self.postprocessor,
-                            n_episodes=n_episodes,
-                            start_seed=start_seed,
-                        )
-                    episodes += info["per_episode"]
-        finally:
-            close_envs(tasks)
+        for envs in environments.vectors:
+            with torch.no_grad():
+                info = eval_policy(
+                    envs,
+                    self.policy,
+                    *processors,
+                    self.preprocessor,
+                    self.postprocessor,
+                    n_episodes=n_episodes,
+                    start_seed=start_seed,
+                )
+            episodes += info["per_episode"]
         return Evaluation(
             successes=[bool(episode["success"]) for episode in episodes],
             max_rewards=[float(episode["max_reward"]) for episode in episodes],

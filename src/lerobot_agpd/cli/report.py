@@ -13,7 +13,7 @@ from lerobot.utils.utils import init_logging
 from rich.console import Console
 from rich.table import Table
 
-from lerobot_agpd.analysis.evaluation import Checkpoint, checkpoint_steps
+from lerobot_agpd.analysis.evaluation import Checkpoint, Environments, checkpoint_steps
 from lerobot_agpd.analysis.report import HEADER, MethodResult, markdown, plot_curves, table_rows
 from lerobot_agpd.analysis.statistics import success_rate
 from lerobot_agpd.replay.store import ReplayStore
@@ -46,7 +46,7 @@ class ReportConfig:
                 raise FileNotFoundError(f"'{name}': {path} does not exist")
 
 
-def evaluate_run(name: str, run: Path, config: ReportConfig) -> MethodResult:
+def evaluate_run(name: str, run: Path, environments: Environments, config: ReportConfig) -> MethodResult:
     """Evaluate a run's last checkpoint, and the earlier ones for its learning curve."""
     steps = checkpoint_steps(run)
     last = max(steps)
@@ -54,11 +54,9 @@ def evaluate_run(name: str, run: Path, config: ReportConfig) -> MethodResult:
     for step, path in steps.items():
         if config.curve_episodes and step != last:
             checkpoint = Checkpoint(path, config.device)
-            curve[step] = checkpoint.evaluate(
-                config.env, config.curve_episodes, config.batch_size, config.seed
-            )
+            curve[step] = checkpoint.evaluate(environments, config.curve_episodes, config.seed)
             logger.info("evaluated %s at step %d: %s", name, step, success_rate(curve[step].successes))
-    result = evaluate_policy(name, steps[last], config)
+    result = evaluate_policy(name, steps[last], environments, config)
     if curve:
         result.curve = {**curve, last: result.final}
     rounds = ReplayStore(run / "agpd").reports()
@@ -68,10 +66,10 @@ def evaluate_run(name: str, run: Path, config: ReportConfig) -> MethodResult:
     return result
 
 
-def evaluate_policy(name: str, path: Path, config: ReportConfig) -> MethodResult:
+def evaluate_policy(name: str, path: Path, environments: Environments, config: ReportConfig) -> MethodResult:
     """Evaluate one checkpoint."""
     checkpoint = Checkpoint(path, config.device)
-    final = checkpoint.evaluate(config.env, config.episodes, config.batch_size, config.seed)
+    final = checkpoint.evaluate(environments, config.episodes, config.seed)
     logger.info("evaluated %s: success %s", name, success_rate(final.successes))
     return MethodResult(name, final, checkpoint.latency())
 
@@ -87,8 +85,11 @@ def show(results: list[MethodResult]) -> None:
 @draccus.wrap()
 def run(config: ReportConfig) -> None:
     """Evaluate, write and show."""
-    results = [evaluate_policy(name, path, config) for name, path in config.policies.items()]
-    results += [evaluate_run(name, path, config) for name, path in config.runs.items()]
+    with Environments(config.env, min(config.batch_size, config.episodes)) as environments:
+        results = [
+            evaluate_policy(name, path, environments, config) for name, path in config.policies.items()
+        ]
+        results += [evaluate_run(name, path, environments, config) for name, path in config.runs.items()]
     rounds: list[dict[str, Any]] = next(
         (result.collection["rounds"] for result in results if result.collection), []
     )

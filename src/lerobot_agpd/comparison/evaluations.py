@@ -15,7 +15,7 @@ from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.envs import EnvConfig
 from lerobot.utils.random_utils import seeded_context
 
-from lerobot_agpd.analysis.evaluation import Checkpoint, Evaluation, checkpoint_steps
+from lerobot_agpd.analysis.evaluation import Checkpoint, Environments, Evaluation, checkpoint_steps
 from lerobot_agpd.analysis.statistics import success_rate
 from lerobot_agpd.comparison.files import read_json, write_json
 from lerobot_agpd.comparison.matrix import MEASURES, EvaluationEntry, Matrix
@@ -35,14 +35,14 @@ class Evaluator:
 
     Args:
         run: the run.
-        env_config: its environment.
+        environments: its environments.
         entry: episodes and seeds.
     """
 
-    def __init__(self, run: Run, env_config: EnvConfig, entry: EvaluationEntry):
+    def __init__(self, run: Run, environments: Environments, entry: EvaluationEntry):
         self.folder = run.folder / EVALUATIONS
         self.folder.mkdir(parents=True, exist_ok=True)
-        self.env_config = env_config
+        self.environments = environments
         self.entry = entry
 
     def curve(self, label: str, path: str | Path) -> Evaluation:
@@ -57,7 +57,7 @@ class Evaluator:
         file = self.folder / f"{name}.json"
         request = {
             "weights": _digest(path),
-            "env": draccus.encode(self.env_config, EnvConfig),
+            "env": draccus.encode(self.environments.config, EnvConfig),
             "episodes": episodes,
             "seed": seed,
             "batch_size": self.entry.batch_size,
@@ -67,9 +67,7 @@ class Evaluator:
         if known is not None:
             return known
         with seeded_context(seed):  # policies that sample do so reproducibly
-            evaluation = Checkpoint(path, self.entry.device).evaluate(
-                self.env_config, episodes, self.entry.batch_size, seed
-            )
+            evaluation = Checkpoint(path, self.entry.device).evaluate(self.environments, episodes, seed)
         write_json(file, {"request": request, **asdict(evaluation)})
         logger.info("evaluated %s %s: success %s", path, name, success_rate(evaluation.successes))
         return evaluation
@@ -134,7 +132,6 @@ def evaluate_run(matrix: Matrix, run: Run, rounds: Sequence[Mapping[str, Any]]) 
         ValueError: if the run's training is not finished.
     """
     task = matrix.tasks[run.task]
-    evaluator = Evaluator(run, environment(task), matrix.evaluation)
     result: dict[str, Any] = {
         "task": run.task,
         "method": run.method,
@@ -143,10 +140,12 @@ def evaluate_run(matrix: Matrix, run: Run, rounds: Sequence[Mapping[str, Any]]) 
         "flags": dict(run.flags),
         "evaluation": asdict(matrix.evaluation),
     }
-    trained = (
-        _evaluate_policy(run, evaluator) if run.policy else _evaluate_training(run, evaluator, task.measure)
-    )
-    result |= trained
+    with Environments(environment(task), matrix.evaluation.batch_size) as environments:
+        evaluator = Evaluator(run, environments, matrix.evaluation)
+        if run.policy:
+            result |= _evaluate_policy(run, evaluator)
+        else:
+            result |= _evaluate_training(run, evaluator, task.measure)
     result["rounds"] = list(rounds)
     result["seconds"] = _seconds(run, rounds)
     result |= {"starts": read_starts(run), "evaluated_with": provenance()}
