@@ -1,5 +1,6 @@
 """Write docs/results/*.md and the README's tables from the committed results: benchmarks/*/report.json,
-benchmarks/latency/latency-*.json and benchmarks/comparison/results/<task>/<method>/<seed>/run.json.
+benchmarks/latency/latency-*.json, benchmarks/diversity/*/sweep.json and
+benchmarks/comparison/results/<task>/<method>/<seed>/run.json.
 
 usage: python benchmarks/render.py          (python benchmarks/render.py --check fails if a page is out of date)
 """
@@ -10,6 +11,7 @@ import re
 import sys
 from pathlib import Path
 
+from lerobot_agpd.analysis.frontier import NAMES
 from lerobot_agpd.analysis.report import MethodResult, markdown
 from lerobot_agpd.comparison.curves import draw_curves
 from lerobot_agpd.comparison.matrix import load_matrix
@@ -82,6 +84,33 @@ def latency_page(path: Path) -> str:
     return f"{(path.parent / 'README.md').read_text().rstrip()}\n\n{where}\n\n{table}\n"
 
 
+def diversity_page(folder: Path) -> str:
+    """A sweep of `lerobot-agpd-diversity`: its text, numbers and pictures."""
+    content = json.loads((folder / "sweep.json").read_text())
+    columns = ("strategy", "strength", "success", "rms to teacher", "rms to student", "KL to teacher, median")
+    header = (*columns, "entropy of visited states", "student's states covered")
+    lines = [header, tuple("---" for _ in header)]
+    for row in content["rows"]:
+        actions = row["actions"]
+        numbers = [actions[key] for key in ("rms_to_teacher", "rms_to_student", "kl_to_teacher_median")]
+        lines.append(
+            (
+                NAMES[row["setting"]["strategy"]],
+                f"{row['setting']['strength']:g}",
+                f"{row['success']:.2f}",
+                *(f"{number:.3f}" for number in numbers),
+                "-" if row["entropy"] is None else f"{row['entropy']:.1f}",
+                f"{row['coverage']:.3f}",
+            )
+        )
+    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    pictures = [
+        f"![{name}](../../benchmarks/diversity/{folder.name}/{name}.png)"
+        for name in ("frontier", "trajectories")
+    ]
+    return "\n\n".join([(folder / "README.md").read_text().rstrip(), table, *pictures]) + "\n"
+
+
 def comparison_page(path: Path, draw: bool) -> str | None:
     """The page of one matrix; None if nothing of it is committed. Its learning curves are drawn beside the results."""
     intro = COMPARISON / f"{path.stem}.md"
@@ -126,6 +155,8 @@ def main() -> None:
         pages[ROOT / "README.md"] = readme(pages[ROOT / "README.md"], folder)
     for path in sorted((ROOT / "benchmarks" / "latency").glob("latency-*.json")):
         pages[ROOT / "docs" / "results" / f"{path.stem}.md"] = latency_page(path)
+    for folder in sorted(path.parent for path in (ROOT / "benchmarks" / "diversity").glob("*/sweep.json")):
+        pages[ROOT / "docs" / "results" / f"diversity-{folder.name}.md"] = diversity_page(folder)
     for path in sorted(COMPARISON.glob("*.yaml")):
         content = comparison_page(path, draw="--check" not in sys.argv)
         if content is not None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 COLOURS = {"replay": "k", "guided": "C1", "interpolate": "C0", "switch": "C2"}
 NAMES = {
@@ -49,6 +50,7 @@ def plot_frontier(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
                     f"{strength:g}", (distance, value), fontsize=7, xytext=(3, 3), textcoords="offset points"
                 )
         axis.set(xlabel="rms distance of actions from the teacher's", ylabel=label, xscale="log")
+        axis.xaxis.set_minor_formatter(NullFormatter())  # labels of minor ticks would overlap
     axes[0].legend(fontsize=8)
     figure.savefig(path)
 
