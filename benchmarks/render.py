@@ -1,6 +1,6 @@
 """Write docs/results/*.md and the README's tables from the committed results: benchmarks/*/report.json,
 benchmarks/latency/latency-*.json, benchmarks/diversity/*/sweep.json and
-benchmarks/comparison/results/<task>/<method>/<seed>/run.json.
+benchmarks/comparison/results/<matrix>/<task>/<method>/<seed>/run.json.
 
 usage: python benchmarks/render.py          (python benchmarks/render.py --check fails if a page is out of date)
 """
@@ -113,13 +113,14 @@ def diversity_page(folder: Path) -> str:
 
 def comparison_page(path: Path, draw: bool) -> str | None:
     """The page of one matrix; None if nothing of it is committed. Its learning curves are drawn beside the results."""
-    intro = COMPARISON / f"{path.stem}.md"
-    if not intro.exists():
+    results_folder = COMPARISON / "results" / path.stem
+    committed = sorted(results_folder.glob("*/*/seed-*/run.json"))
+    if not committed:
         return None
-    runs_folder = json.loads((COMPARISON / "results" / "runs_folders.json").read_text())[path.stem]
-    os.environ["AGPD_RUNS"] = runs_folder  # where the runs were made: it is part of their flags
+    root = json.loads(committed[0].read_text())["flags"]["dataset.root"]
+    os.environ["AGPD_RUNS"] = root.rpartition("/data/")[0]  # where the runs were made: part of their flags
     matrix = load_matrix(path)
-    matrix.output = COMPARISON / "results"
+    matrix.output = results_folder
     found: dict[str, dict[str, list[RunResult]]] = {}
     missing = []
     for run in expand(matrix):
@@ -132,7 +133,7 @@ def comparison_page(path: Path, draw: bool) -> str | None:
     found = {
         task: {name: methods[name] for name in order if name in methods} for task, methods in found.items()
     }
-    parts = [intro.read_text().rstrip(), report(matrix, found, missing).rstrip()]
+    parts = [(COMPARISON / f"{path.stem}.md").read_text().rstrip(), report(matrix, found, missing).rstrip()]
     for task, methods in found.items():
         picture = matrix.output / f"curves-{task}.png"
         if draw:
