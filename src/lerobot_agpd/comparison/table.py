@@ -75,7 +75,9 @@ def report(matrix: Matrix, results: Mapping[str, Methods], missing: Sequence[str
 
 def _remarks(matrix: Matrix, results: Mapping[str, Methods], missing: Sequence[str]) -> list[str]:
     everything = [result for methods in results.values() for runs in methods.values() for result in runs]
-    remarks = [f"- `{name}`: {method.note}" for name, method in matrix.methods.items() if method.note]
+    shown = {name for methods in results.values() for name in methods}
+    notes = {name: method.note for name, method in matrix.methods.items() if name in shown and method.note}
+    remarks = [f"- `{name}`: {note}" for name, note in notes.items()]
     early = [f"{result.run.name} ({result.rounds_adopted})" for result in everything if result.rounds_adopted]
     if early:
         remarks.append(
