@@ -98,3 +98,13 @@ def agpd_diffusion_config(input_features, output_features):
 @pytest.fixture(autouse=True)
 def seeded():
     torch.manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def rendering() -> None:
+    """Skip tests that need images where MuJoCo cannot open a graphics context."""
+    mujoco = pytest.importorskip("mujoco")
+    try:
+        mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
+    except Exception as error:  # whatever the graphics library raises
+        pytest.skip(f"no graphics context (is MUJOCO_GL set?): {error}")

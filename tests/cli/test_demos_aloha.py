@@ -16,13 +16,8 @@ ENV_OPTIONS = {"observation_height": 12, "observation_width": 16, "shadows": Fal
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory) -> LeRobotDataset:
+def recorded(rendering, tmp_path_factory) -> LeRobotDataset:
     """An expert's and an operator's episode, recorded through the console command."""
-    mujoco = pytest.importorskip("mujoco")
-    try:
-        mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
-    except Exception as error:  # whatever the graphics library raises
-        pytest.skip(f"no graphics context (is MUJOCO_GL set?): {error}")
     root = tmp_path_factory.mktemp("demos") / "aloha"
     argv = ["lerobot-agpd-demos", "--env.type=aloha_state", "--env.task=AlohaTransferCube-v0"]
     argv += [

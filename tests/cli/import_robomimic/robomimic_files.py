@@ -6,6 +6,12 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_agpd.cli.import_robomimic import ImportRobomimicConfig, import_robomimic
+
+LENGTHS = (48, 47, 6, 5)
+"""Steps of the demonstrations that the tests share."""
 
 OSC_POSE = {
     "type": "OSC_POSE",
@@ -154,3 +160,23 @@ def write(
         for key, demos in (masks or {}).items():
             file.create_dataset(f"mask/{key}", data=np.array(demos, dtype="S"))
     return path
+
+
+def part(rollout: Rollout, start: int = 0, stop: int = 3) -> Rollout:
+    """Some steps of a rollout."""
+    parts = [
+        {key: values[start:stop] for key, values in arrays.items()}
+        for arrays in (rollout.arrays, rollout.obs, rollout.next_obs)
+    ]
+    return Rollout(*parts, rollout.attributes)
+
+
+def run_import(source: Path, root: Path, **options) -> LeRobotDataset:
+    """Import a file as the command does."""
+    return import_robomimic(ImportRobomimicConfig(source=source, root=root, **options))
+
+
+def column(dataset: LeRobotDataset, key: str, episode: int) -> np.ndarray:
+    """What an imported dataset holds of one episode."""
+    rows = dataset.hf_dataset.with_format("numpy")[:]
+    return np.stack(rows[key])[rows["episode_index"] == episode]

@@ -1,0 +1,166 @@
+"""What a comparison makes of its results: differences, tables, curves."""
+
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from matrices import content, evaluation, load
+from scipy.stats import t
+
+from lerobot_agpd.analysis.latency import Latency
+from lerobot_agpd.comparison.curves import draw_curves, mean_curve
+from lerobot_agpd.comparison.evaluations import RESULT
+from lerobot_agpd.comparison.files import write_json
+from lerobot_agpd.comparison.results import compare, read_result
+from lerobot_agpd.comparison.rounds import HEADER, collection_rows
+from lerobot_agpd.comparison.runs import expand
+from lerobot_agpd.comparison.table import difference_rows, method_row, report, training_time
+
+pytest.importorskip("lerobot_policy_agpd")  # registers the policy and environment types
+
+
+def store(run, matrix, best, last, curve=None, rounds=(), seconds=None, adopted=0, torch="2") -> None:
+    write_json(
+        run.folder / RESULT,
+        {
+            "flags": run.flags,
+            "evaluation": asdict(matrix.evaluation),
+            "measure": matrix.tasks[run.task].measure,
+            "steps": None if run.policy else 20,
+            "curve": {step: asdict(evaluation(values, 500_000)) for step, values in (curve or {}).items()},
+            "best": {"step": 10, **asdict(evaluation(best))},
+            "last": {"step": 20, **asdict(evaluation(last))},
+            "latency": asdict(Latency(2.0, 3.0, 1_500_000, 1)),
+            "rounds": list(rounds),
+            "seconds": seconds or {"total": 50.0},
+            "starts": [{"rounds_adopted": adopted, "git": None, "versions": {"torch": "2"}}],
+            "evaluated_with": {"git": None, "versions": {"torch": torch}},
+        },
+    )
+
+
+def collected(guided, unguided, actions=None, states=None) -> dict:
+    """A round's report; generated, successful and kept episodes of both parts, none of them trivial."""
+    keys = ("generated", "successful", "kept")
+    parts = [dict(zip(keys, part, strict=True)) for part in (guided, unguided)]
+    return {
+        **{key: parts[0][key] + parts[1][key] for key in keys},
+        "guided": {"trivial": 0, **parts[0]},
+        "unguided": {"trivial": 0, **parts[1]},
+        "mean_shift_in_sigmas": 0.5,
+        "diagnostics": {"actions": actions, "states": states} if actions or states else None,
+        "seconds": {"teacher": 2.0, "environment": 1.0},
+    }
+
+
+@pytest.fixture
+def compared(tmp_path):
+    """Two methods with two training seeds, a teacher, four environments; outcomes known."""
+    matrix = load(tmp_path, content(tmp_path))
+    runs = {run.name: run for run in expand(matrix)}
+    for run in runs.values():
+        run.folder.mkdir(parents=True)
+    curve = {10: [1, 1], 20: [1, 0]}
+    store(runs["pusht/bc/seed-1"], matrix, [1, 0, 0, 0], [0, 0, 0, 0], curve)
+    store(runs["pusht/bc/seed-2"], matrix, [1, 1, 0, 0], [1, 0, 0, 0], {10: [0, 0], 20: [1, 1]})
+    round_ = collected(guided=(6, 6, 5), unguided=(4, 2, 2))
+    spent = {"total": 60.0, "teacher": 20.0, "environment": 10.0}
+    store(runs["pusht/agpd/seed-1"], matrix, [1, 1, 1, 0], [1, 1, 0, 0], curve, [round_, round_], spent)
+    store(runs["pusht/agpd/seed-2"], matrix, [1, 1, 1, 1], [1, 1, 1, 0], curve, [round_], spent, adopted=1)
+    store(runs["pusht/teacher/policy"], matrix, [1, 1, 1, 0], [1, 1, 1, 0])
+    results = {}
+    for run in runs.values():
+        results.setdefault(run.method, []).append(read_result(run, matrix))
+    return matrix, results
+
+
+def test_differences_are_paired_by_seed_and_environment(compared):
+    _, results = compared
+    difference = compare(results["agpd"], results["bc"], "best", "success")
+    # differences [[0, 1, 1, 0], [0, 0, 1, 1]]: equal row means, so MS_seed = 0 is replaced by MS_rest;
+    # column means 0, .5, 1, .5 about .5: MS_environment = 2 * .5 / 3 = 1/3; residuals 0, +-.5, 0, +-.5: MS_rest = 1/3
+    half = t.ppf(0.975, 1) * np.sqrt(1 / 3 / 8)
+    assert difference.mean == 0.5 and difference.n_seeds == 2
+    assert (difference.low, difference.high) == pytest.approx((0.5 - half, 0.5 + half))
+    against_teacher = compare(results["agpd"], results["teacher"], "last", "success")
+    assert against_teacher.mean == pytest.approx((2 / 4 + 3 / 4) / 2 - 3 / 4) and against_teacher.n_seeds == 2
+    assert compare(results["teacher"], results["bc"], "last", "max_reward").mean == pytest.approx(
+        0.5 * (0.75 - 0.125)
+    )
+    assert compare(results["bc"][:1], results["agpd"][1:], "best", "success") is None
+
+
+def test_a_row_of_the_table(compared):
+    _, results = compared
+    row = method_row("agpd", results["agpd"])
+    assert row[:2] == ("agpd", "20")
+    assert row[2].startswith("0.88 [") and row[3].startswith("0.62 [") and row[4] == "0.50 / 0.75"
+    assert row[7] == "8", "two training seeds of four environments"
+    assert row[8] == "15 / 12 / 10", "means per training seed"
+    assert row[9] == training_time(results["agpd"]) == "60 s: environment 10, teacher 20, training 30"
+    assert row[10:] == ("1.50 M", "2.0")
+    teacher = method_row("teacher", results["teacher"])
+    assert (teacher[1], teacher[2], teacher[8], teacher[9]) == ("-", "-", "-", "-")
+
+
+def test_collection_rounds_are_pooled_and_averaged(compared):
+    _, results = compared
+    run = replace(
+        results["agpd"][0],
+        rounds=[
+            collected((8, 6, 6), (2, 1, 1), {"rms_to_teacher": 0.1}, {"entropy": -1.0, "coverage": None}),
+            collected((8, 2, 2), (0, 0, 0), {"rms_to_teacher": 0.3}, {"entropy": -2.0, "coverage": 0.5}),
+        ],
+    )
+    rows = collection_rows({"bc": results["bc"], "agpd": [run]})
+    assert rows == [
+        ("agpd", "0.50", "0.50", "0.50", "0.200", "-", "-", "-", "-1.50", "0.50", "3"),
+    ], "8 of 16 guided, 1 of 2 unguided; nothing of a method without rounds"
+    assert len(rows[0]) == len(HEADER)
+
+
+def test_the_report_says_what_is_missing_and_what_was_disturbed(compared):
+    matrix, results = compared
+    text = report(matrix, {"pusht": results}, ["pusht/dagger/seed-1"])
+    assert "## pusht" in text and "Not finished: pusht/dagger/seed-1" in text
+    assert "`agpd`: the whole method" in text and "pusht/agpd/seed-2 (1)" in text
+    assert "same code" not in text
+    assert "| agpd | +0.50 [" in text and "4 other environments (seeds from 100000)" in text
+
+
+def test_the_report_says_if_the_code_changed_on_the_way(compared):
+    matrix, results = compared
+    run = results["bc"][0].run
+    store(run, matrix, [1, 0, 0, 0], [0, 0, 0, 0], {10: [1, 1], 20: [1, 0]}, torch="3")
+    results["bc"][0] = read_result(run, matrix)
+    text = report(matrix, {"pusht": results}, [])
+    assert "Not all was made with the same code: torch 2; torch 3.**" in text
+
+
+def test_differences_without_spread_are_not_shown_as_certain(compared):
+    _, results = compared
+    rows = difference_rows({"a": results["bc"], "b": results["bc"]}, "last", "success")
+    assert rows == [("a", "", "+0.00 (in every pair)"), ("b", "+0.00 (in every pair)", "")]
+
+
+def test_curves_are_means_over_training_seeds(compared, tmp_path):
+    _, results = compared
+    steps, values = mean_curve(results["bc"], "success")
+    assert steps.tolist() == [10, 20] and values.tolist() == [[1, 0.5], [0, 1]]
+    draw_curves(results, "success", "a task", tmp_path / "curves.png")
+    assert (tmp_path / "curves.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_result_is_trusted_only_if_whole_and_of_this_matrix(compared, tmp_path):
+    matrix, results = compared
+    run = results["bc"][0].run
+    matrix.evaluation.episodes = 5
+    with pytest.raises(ValueError, match="other evaluation than the matrix has now"):
+        read_result(run, matrix)
+    path = run.folder / RESULT
+    text = path.read_text()
+    path.write_text(text[: len(text) // 2])
+    with pytest.raises(ValueError, match=r"run\.json is damaged .* remove it"):
+        read_result(run, matrix)
+    path.unlink()
+    assert read_result(run, matrix) is None
