@@ -24,8 +24,8 @@ from lerobot.utils.constants import DONE, REWARD, SUCCESS
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from lerobot_agpd.cli.progress import episode_bar
 from lerobot_agpd.collect.config import EVALUATION_SEEDS
 from lerobot_agpd.envs.base import SingleEnvConfig
 from lerobot_agpd.envs.demonstrations import DemosReport, Frame, play_episode
@@ -172,25 +172,18 @@ def record_demos(config: DemosConfig) -> DemosReport:
             use_videos=False,
         )
         task_description = env.get_wrapper_attr("task_description")
-        with _progress() as progress:
-            bar = progress.add_task(report.task, total=config.episodes)
+        with episode_bar(report.task, config.episodes) as advance:
             for frames in successful_episodes(env, expert, config, report):
                 for frame in frames:
                     dataset.add_frame({**frame, "task": task_description})
                 dataset.save_episode()
-                progress.advance(bar)
+                advance(1)
         dataset.finalize()
     finally:
         env.close()
     (partial / REPORT_PATH).write_text(json.dumps(asdict(report), indent=2) + "\n")
     partial.rename(config.root)
     return report
-
-
-def _progress() -> Progress:
-    return Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    )
 
 
 @draccus.wrap()

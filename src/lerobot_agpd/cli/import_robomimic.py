@@ -17,10 +17,11 @@ from datasets import disable_progress_bars
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.utils import init_logging
 
-from lerobot_agpd.cli.shards import Frame, ShardedWriter
+from lerobot_agpd.cli.progress import episode_bar
 from lerobot_agpd.envs.robomimic_columns import RobomimicColumns, cameras_of, task_of
 from lerobot_agpd.envs.robomimic_hdf5 import RobomimicFile, sha256
 from lerobot_agpd.envs.robomimic_recordings import RECORDINGS_PATH, copy_recordings
+from lerobot_agpd.envs.shards import Frame, ShardedWriter
 
 logger = logging.getLogger(__name__)
 
@@ -146,7 +147,8 @@ def import_robomimic(config: ImportRobomimicConfig) -> LeRobotDataset:
             (root / REPORT_PATH).write_text(json.dumps(report, indent=2) + "\n")
 
         writer = ShardedWriter(config.root, plan)
-        writer.write(len(demos), config.episodes_per_shard, create, frames)
+        with episode_bar("episodes", len(demos)) as advance:
+            writer.write(len(demos), config.episodes_per_shard, create, frames, advance)
         return writer.merge(config.repo_id, add_provenance)
 
 

@@ -18,7 +18,6 @@ from lerobot_agpd.envs.base import (
     ENVIRONMENT_STATE,
     PIXELS,
     SingleEnvConfig,
-    check_image_size,
     require_packages,
 )
 
@@ -81,18 +80,10 @@ class AlohaStateEnvConfig(SingleEnvConfig, LeRobotAlohaEnv):
         """
         if self.task not in ALOHA_TASKS:
             raise ValueError(f"--env.task must be one of {', '.join(ALOHA_TASKS)}; got {self.task!r}.")
-        if self.obs_type not in OBSERVED_KEYS:
-            raise ValueError(
-                f"--env.obs_type must be one of {', '.join(OBSERVED_KEYS)}; got {self.obs_type!r}."
-            )
+        self.check_options(OBSERVED_KEYS, FPS)
         unknown = [camera for camera in self.cameras if camera not in CAMERAS]
         if unknown or not self.cameras:
             raise ValueError(f"--env.cameras={self.cameras} must name at least one of {', '.join(CAMERAS)}.")
-        if self.fps != FPS:
-            raise ValueError(f"{self.task} runs at {FPS} steps per second; --env.fps={self.fps} cannot be.")
-        if self.episode_length < 1:
-            raise ValueError(f"--env.episode_length must be at least 1, got {self.episode_length}.")
-        check_image_size(self.observation_height, self.observation_width)
         keys = OBSERVED_KEYS[self.obs_type]
         image = PolicyFeature(FeatureType.VISUAL, (self.observation_height, self.observation_width, 3))
         self.features = {ACTION: PolicyFeature(FeatureType.ACTION, (14,))}
@@ -129,4 +120,5 @@ class AlohaStateEnvConfig(SingleEnvConfig, LeRobotAlohaEnv):
     @property
     def factory(self) -> partial[gym.Env]:
         """Builds one environment; see `make_single_env`."""
+        assert self.episode_length is not None  # checked by __post_init__
         return partial(make_single_env, str(self.task), self.episode_length, self.gym_kwargs)

@@ -2,7 +2,7 @@
 
 import importlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import gymnasium as gym
 import numpy as np
@@ -22,18 +22,6 @@ def unbounded(dim: int) -> gym.spaces.Box:
 def image_space(height: int, width: int) -> gym.spaces.Box:
     """Space of uint8 images (height, width, 3)."""
     return gym.spaces.Box(0, 255, shape=(height, width, 3), dtype=np.uint8)
-
-
-def check_image_size(height: int, width: int) -> None:
-    """Check an observed image's size against what LeRobot can tell from channels.
-
-    Raises:
-        ValueError: if a side has fewer than 4 pixels.
-    """
-    if min(height, width) < 4:
-        raise ValueError(
-            f"--env.observation_height={height} and --env.observation_width={width} must be at least 4 pixels."
-        )
 
 
 def make_vector_env(factory: Callable[[], gym.Env], n_envs: int, use_async_envs: bool) -> VectorEnv:
@@ -85,6 +73,36 @@ class SingleEnvConfig(ABC):
     type: str
     task: str | None
     fps: int | None
+    # Of every type here:
+    obs_type: str
+    episode_length: int | None
+    observation_height: int
+    observation_width: int
+
+    def check_options(self, obs_types: Collection[str], fps: int, episode_length: int | None = None) -> None:
+        """Check what every type has, and fill in what the task decides where it was left at None.
+
+        Args:
+            obs_types: the known ones.
+            fps: the simulation's, control steps per second.
+            episode_length: the task's own limit, if it has one.
+
+        Raises:
+            ValueError: naming the option that cannot be.
+        """
+        if self.obs_type not in obs_types:
+            raise ValueError(f"--env.obs_type must be one of {', '.join(obs_types)}; got {self.obs_type!r}.")
+        self.fps = fps if self.fps is None else self.fps
+        if self.fps != fps:
+            raise ValueError(f"{self.task} runs at {fps} steps per second; --env.fps={self.fps} cannot be.")
+        self.episode_length = episode_length if self.episode_length is None else self.episode_length
+        if self.episode_length is None or self.episode_length < 1:
+            raise ValueError(f"--env.episode_length must be at least 1, got {self.episode_length}.")
+        if min(self.observation_height, self.observation_width) < 4:  # LeRobot takes 1 to 3 for channels
+            raise ValueError(
+                f"--env.observation_height={self.observation_height} and --env.observation_width="
+                f"{self.observation_width} must be at least 4 pixels."
+            )
 
     @property
     @abstractmethod

@@ -23,7 +23,6 @@ from lerobot_agpd.envs.base import (
     ENVIRONMENT_STATE,
     PIXELS,
     SingleEnvConfig,
-    check_image_size,
     require_packages,
 )
 from lerobot_agpd.envs.robotics_tasks import (
@@ -101,20 +100,7 @@ class GymnasiumRoboticsEnv(SingleEnvConfig, EnvConfig):
             ValueError: if an option is unknown or does not fit the task.
         """
         spec = get_task_spec(self.task)
-        if self.obs_type not in OBSERVED_KEYS:
-            raise ValueError(
-                f"--env.obs_type must be one of {', '.join(OBSERVED_KEYS)}; got {self.obs_type!r}."
-            )
-        self.fps = spec.fps if self.fps is None else self.fps
-        if self.fps != spec.fps:
-            raise ValueError(
-                f"{self.task} runs at {spec.fps} steps per second; --env.fps={self.fps} cannot be."
-            )
-        if self.episode_length is None:
-            self.episode_length = spec.episode_length
-        if self.episode_length < 1:
-            raise ValueError(f"--env.episode_length must be at least 1, got {self.episode_length}.")
-        check_image_size(self.observation_height, self.observation_width)
+        self.check_options(OBSERVED_KEYS, spec.fps, spec.episode_length)
         self._check_kitchen_tasks()
         shapes = {
             AGENT_POS: (FeatureType.STATE, (spec.layout.agent_pos_dim,)),

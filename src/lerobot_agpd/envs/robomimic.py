@@ -18,7 +18,6 @@ from lerobot_agpd.envs.base import (
     ENVIRONMENT_STATE,
     PIXELS,
     SingleEnvConfig,
-    check_image_size,
     require_packages,
 )
 from lerobot_agpd.envs.robomimic_tasks import FPS, OBSERVED_KEYS, get_task
@@ -73,18 +72,9 @@ class RobomimicEnvConfig(SingleEnvConfig, EnvConfig):
             ValueError: if an option is unknown or does not fit the task.
         """
         task = get_task(self.task)
-        if self.obs_type not in OBSERVED_KEYS:
-            raise ValueError(
-                f"--env.obs_type must be one of {', '.join(OBSERVED_KEYS)}; got {self.obs_type!r}."
-            )
-        if self.fps != FPS:
-            raise ValueError(f"{self.task} runs at {FPS} steps per second; --env.fps={self.fps} cannot be.")
+        self.check_options(OBSERVED_KEYS, FPS, task.episode_length)
         if self.render_mode != "rgb_array":
             raise ValueError(f"--env.render_mode={self.render_mode}: only rgb_array can be rendered.")
-        if self.episode_length is None:
-            self.episode_length = task.episode_length
-        if self.episode_length < 1:
-            raise ValueError(f"--env.episode_length must be at least 1, got {self.episode_length}.")
         if self.cameras is None:
             self.cameras = list(task.cameras)
         known = (*task.cameras, *task.more_cameras)
@@ -92,7 +82,6 @@ class RobomimicEnvConfig(SingleEnvConfig, EnvConfig):
             raise ValueError(
                 f"--env.cameras={self.cameras} must name at least one of {', '.join(known)} for {self.task}."
             )
-        check_image_size(self.observation_height, self.observation_width)
         self._derive_features()
 
     def _derive_features(self) -> None:

@@ -12,7 +12,6 @@ from typing import Any
 
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 Frame = dict[str, Any]
 
@@ -61,32 +60,31 @@ class ShardedWriter:
         episodes_per_shard: int,
         create: Callable[[Path], LeRobotDataset],
         frames: Callable[[int], Iterator[Frame]],
+        advance: Callable[[int], None],
     ) -> None:
-        """Write the episodes that no finished shard holds, with a progress bar.
+        """Write the episodes that no finished shard holds.
 
         Args:
             n_episodes: episodes of the whole dataset.
             episodes_per_shard: how many a killed run loses at most.
             create: makes an empty dataset in a new folder.
             frames: the frames of an episode.
+            advance: told how many more episodes are there, be they written now or before.
         """
-        starts = range(0, n_episodes, episodes_per_shard)
-        with _progress() as progress:
-            bar = progress.add_task("episodes", total=n_episodes)
-            for start in starts:
-                episodes = range(start, min(start + episodes_per_shard, n_episodes))
-                if self._shard(start).exists():
-                    progress.advance(bar, len(episodes))
-                    continue
-                shutil.rmtree(self._unfinished, ignore_errors=True)
-                shard = create(self._unfinished)
-                for episode in episodes:
-                    for frame in frames(episode):
-                        shard.add_frame(frame)
-                    shard.save_episode()
-                    progress.advance(bar)
-                shard.finalize()
-                self._unfinished.rename(self._shard(start))
+        for start in range(0, n_episodes, episodes_per_shard):
+            episodes = range(start, min(start + episodes_per_shard, n_episodes))
+            if self._shard(start).exists():
+                advance(len(episodes))
+                continue
+            shutil.rmtree(self._unfinished, ignore_errors=True)
+            shard = create(self._unfinished)
+            for episode in episodes:
+                for frame in frames(episode):
+                    shard.add_frame(frame)
+                shard.save_episode()
+                advance(1)
+            shard.finalize()
+            self._unfinished.rename(self._shard(start))
 
     @property
     def _unfinished(self) -> Path:
@@ -115,9 +113,3 @@ class ShardedWriter:
         merged.rename(self.root)
         shutil.rmtree(self.partial)
         return LeRobotDataset(repo_id, root=self.root)
-
-
-def _progress() -> Progress:
-    return Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    )
