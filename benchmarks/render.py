@@ -1,5 +1,5 @@
 """Write docs/results/*.md and the README's tables from the committed results: benchmarks/*/report.json,
-benchmarks/latency/latency-*.json, benchmarks/diversity/*/sweep.json and
+benchmarks/latency/latency-*.json, benchmarks/diversity/*/sweep.json, benchmarks/environments/*.json and
 benchmarks/comparison/results/<matrix>/<task>/<method>/<seed>/run.json.
 
 usage: python benchmarks/render.py          (python benchmarks/render.py --check fails if a page is out of date)
@@ -11,8 +11,11 @@ import re
 import sys
 from pathlib import Path
 
+import numpy as np
+
 from lerobot_agpd.analysis.frontier import NAMES
 from lerobot_agpd.analysis.report import MethodResult, markdown
+from lerobot_agpd.analysis.statistics import success_rate
 from lerobot_agpd.comparison.curves import draw_curves
 from lerobot_agpd.comparison.matrix import load_matrix
 from lerobot_agpd.comparison.results import RunResult, read_result
@@ -111,6 +114,32 @@ def diversity_page(folder: Path) -> str:
     return "\n\n".join([(folder / "README.md").read_text().rstrip(), table, *pictures]) + "\n"
 
 
+def environments_page(folder: Path) -> str:
+    """How often operators succeed and how fast the environments are."""
+    played: dict[tuple[str, int], dict[float, dict]] = {}
+    for row in json.loads((folder / "experts.json").read_text()):
+        played.setdefault((row["task"], row["episode_length"]), {})[row["skill"]] = row
+    skills = sorted({skill for cells in played.values() for skill in cells}, reverse=True)
+    header = ("", "steps", *(f"skill {skill:g}" for skill in skills))
+    lines = [header, tuple("---" for _ in header)]
+    for (task, episode_length), cells in played.items():
+        lines.append((task, str(episode_length), *(operator_cell(cells[skill]) for skill in skills)))
+    speed = json.loads((folder / "speed.json").read_text())
+    rows = [("", "steps per second", "least", "most"), ("---",) * 4]
+    for name, row in speed["rows"].items():
+        rows.append((name, *(f"{row[key]:.3g}" for key in ("steps_per_second", "least", "most"))))
+    experts, speeds = ("\n".join("| " + " | ".join(line) + " |" for line in table) for table in (lines, rows))
+    text = (folder / "README.md").read_text().rstrip()
+    return text.format(experts=experts, speeds=speeds, ratio=f"{speed['aloha_ratio']:.1f}") + "\n"
+
+
+def operator_cell(row: dict) -> str:
+    """Success with interval and N; the median length of successes."""
+    lengths = [length for length, success in zip(row["lengths"], row["successes"], strict=True) if success]
+    median = f"{np.median(lengths):.0f}" if lengths else "-"
+    return f"{success_rate(row['successes'])}, N = {len(row['successes'])}; {median}"
+
+
 def comparison_page(path: Path, draw: bool) -> str | None:
     """The page of one matrix; None if nothing of it is committed. Its learning curves are drawn beside the results."""
     results_folder = COMPARISON / "results" / path.stem
@@ -158,6 +187,10 @@ def main() -> None:
         pages[ROOT / "docs" / "results" / f"{path.stem}.md"] = latency_page(path)
     for folder in sorted(path.parent for path in (ROOT / "benchmarks" / "diversity").glob("*/sweep.json")):
         pages[ROOT / "docs" / "results" / f"diversity-{folder.name}.md"] = diversity_page(folder)
+    if (ROOT / "benchmarks" / "environments" / "speed.json").exists():
+        pages[ROOT / "docs" / "results" / "environments.md"] = environments_page(
+            ROOT / "benchmarks" / "environments"
+        )
     for path in sorted(COMPARISON.glob("*.yaml")):
         content = comparison_page(path, draw="--check" not in sys.argv)
         if content is not None:

@@ -74,3 +74,17 @@ def test_episodes_of_the_student_alone_are_counted_apart():
     assert summary["guided"]["generated"] == summary["unguided"]["generated"] == 1
     assert summary["mean_student_steps"] == 6.0  # where the teacher took over
     assert summarise(RECORDS)["student_alone"]["generated"] == 0
+
+
+def test_failed_starts_that_are_tried_again_are_counted_apart():
+    """They are harder: neither the strategy's nor the teacher's rate of success includes them."""
+    again = [
+        record(retry=True),
+        record(retry=True, passed=False),
+        record(scale=0.0, retry=True, passed=False),
+    ]
+    summary = summarise([*again, *RECORDS])
+    assert summary["retried"] == {"generated": 3, "trivial": 0, "successful": 1, "kept": 1}
+    assert summary["guided"] == summarise(RECORDS)["guided"]
+    assert summary["unguided"] == summarise(RECORDS)["unguided"]
+    assert summary["generated"] == 10 and summary["kept"] == 4

@@ -1,6 +1,7 @@
 """Rounds on Push-T with a toy teacher and student: resuming, and what diagnostics must not change."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -206,12 +207,43 @@ def test_rollin_records_the_teachers_part(tmp_path, demonstrations):
 
 
 def test_spools_of_older_rounds_are_read(tmp_path, demonstrations):
-    """Their records know nothing of the student's part."""
+    """Their records know nothing of the student's part and of retries."""
     rounds = Rounds(tmp_path, demonstrations, strategy="guided")
     rounds.collect()
     spool = rounds.store.spool(0, 0)
     lines = [json.loads(line) for line in spool.log.read_text().splitlines()]
-    older = [{k: v for k, v in line.items() if not k.startswith("student_")} for line in lines]
+    new = ("student_steps", "student_alone", "retry")
+    older = [{k: v for k, v in line.items() if k not in new} for line in lines]
     spool.log.write_text("".join(json.dumps(line) + "\n" for line in older))
     _, records, _ = rounds.collect()
     assert len(records) == EPISODES and not any(record.student_alone for record in records)
+
+
+@pytest.mark.parametrize("strategy", ["replay", "guided"])
+def test_the_next_round_starts_again_where_the_last_one_failed(tmp_path, demonstrations, strategy):
+    rounds = Rounds(tmp_path, demonstrations, strategy=strategy, retry_fraction=0.5)
+    scale = SCALE if strategy == "guided" else 0.0
+    fresh = [ticket.seed for ticket in rounds.runner.tickets(0, scale)]
+    failing = {fresh[0], fresh[2], fresh[3]}
+
+    def judge(episode):
+        record = keep(episode)
+        passed = record.seed not in failing
+        return replace(record, passed=passed, kept=passed, retry=episode.ticket.retry)
+
+    rounds.runner.filter = SimpleNamespace(judge=judge)
+    _, records, seconds = rounds.collect(0)
+    assert not any(record.retry for record in records)
+    rounds.runner.finish(0, rounds.runner.report(0, SCALE, records, seconds))
+
+    tickets = rounds.runner.tickets(1, scale)
+    retried = [ticket for ticket in tickets if ticket.retry]
+    assert len(retried) == EPISODES // 2 and {ticket.seed for ticket in retried} < failing
+    failing.clear()
+    _, records, seconds = rounds.collect(1)
+    report = rounds.runner.report(1, SCALE, records, seconds)
+    assert [record.seed for record in records if record.retry] == [ticket.seed for ticket in retried]
+    assert report["retried"]["successful"] == EPISODES // 2
+    rounds.runner.finish(1, report)
+    (left,) = [ticket.seed for ticket in rounds.runner.tickets(2, scale) if ticket.retry]
+    assert left not in {ticket.seed for ticket in retried}

@@ -4,7 +4,7 @@ from hypothesis import given, strategies as st
 from scipy.stats import kstest
 
 from lerobot_agpd.collect.config import COLLECTION_SEEDS, EVALUATION_SEEDS
-from lerobot_agpd.collect.seeds import noise_seed, round_tickets, share_of
+from lerobot_agpd.collect.seeds import failed_starts, noise_seed, round_tickets, share_of
 
 
 def tickets(n=50, seed=1000, rank=0, number=0, scale=2.0, fraction=0.2, n_ranks=1):
@@ -106,3 +106,37 @@ def test_variation_belongs_to_the_ticket():
         assert ours.student_share == theirs.student_share
         assert 8 * ours.scale == pytest.approx(theirs.scale)
     assert varied(50, scale=8.0, **options) == large
+
+
+def entry(seed, passed=False, trivial=False):
+    return {"seed": seed, "passed": passed, "trivial": trivial}
+
+
+def test_failed_starts_by_hand():
+    """3 was solved at the second attempt, 4 is solved from the start, 2 was tried twice and comes last."""
+    reports = [
+        {"episodes": [entry(1, passed=True), entry(2), entry(3), entry(4, trivial=True)]},
+        {"episodes": [entry(2), entry(3, passed=True), entry(5)]},
+        {"episodes": [entry(6)]},
+    ]
+    assert failed_starts(reports) == [5, 6, 2]
+    assert failed_starts([]) == []
+
+
+def test_retries_take_the_first_places_of_the_strategy():
+    fresh, again = varied(10), varied(10, retries=[7, 8, 9])
+    assert [ticket.seed for ticket in again if ticket.retry] == [7, 8, 9]
+    for before, after in zip(fresh, again, strict=True):
+        assert (after.number, after.scale) == (before.number, before.scale)
+        assert after.retry or after == before
+        assert after.guided or not after.retry
+    assert (
+        sum(ticket.retry for ticket in varied(10, retries=range(50))) == 8
+    )  # the unguided fifth keeps its starts
+
+
+def test_a_retry_is_varied_anew_in_every_round():
+    options = {"scale_spread": 3.0, "max_student_share": 0.5, "retries": [7]}
+    first, second = (round_tickets(5, 1000, 0, 1, number, 2.0, 0.2, **options)[0] for number in (1, 2))
+    assert first.seed == second.seed == 7
+    assert first.scale != second.scale and first.student_share != second.student_share

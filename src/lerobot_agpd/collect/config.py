@@ -150,6 +150,9 @@ class CollectConfig:
     unguided_fraction: float = (
         0.2  # share of a round without guidance or mixing, to know the teacher's own rate
     )
+    retry_fraction: float = (
+        0.0  # share of a round, at most, that starts again where the earlier rounds' episodes have failed
+    )
     min_reward: float | None = (
         None  # keep episodes whose largest reward reaches this; default: the environment's is_success
     )
@@ -183,10 +186,11 @@ class CollectConfig:
             self.rounds is None or self.rounds >= 0,
             f"--policy.collect.rounds must not be negative, got {self.rounds}",
         )
-        require(
-            0 <= self.unguided_fraction <= 1,
-            f"--policy.collect.unguided_fraction must be in [0, 1], got {self.unguided_fraction}",
-        )
+        for name in ("unguided_fraction", "retry_fraction"):
+            require(
+                0 <= getattr(self, name) <= 1,
+                f"--policy.collect.{name} must be in [0, 1], got {getattr(self, name)}",
+            )
         require(
             self.n_action_steps is None or self.n_action_steps >= 1,
             f"--policy.collect.n_action_steps must be at least 1, got {self.n_action_steps}",

@@ -28,14 +28,18 @@ def success_rate(counts: Sequence[dict[str, int]]) -> float | None:
 
 
 def summarise(records: Sequence[EpisodeRecord]) -> dict[str, Any]:
-    """The numbers of a round: episodes with guidance (or mixing), the teacher's own, and the student's own."""
+    """The numbers of a round: episodes with guidance (or mixing), the teacher's own, and the student's own.
+
+    Rates of success are those of new starts: failed ones that are tried again are harder, and have their own count.
+    """
     with_teacher = [record for record in records if not record.student_alone]
-    guided = [record for record in with_teacher if record.scale > 0]
-    unguided = [record for record in with_teacher if record.scale == 0]
+    guided = [record for record in with_teacher if record.scale > 0 and not record.retry]
+    unguided = [record for record in with_teacher if record.scale == 0 and not record.retry]
     return {
         **tally(records),
         "guided": tally(guided),
         "unguided": tally(unguided),
+        "retried": tally([record for record in records if record.retry]),
         "student_alone": tally([record for record in records if record.student_alone]),
         "mean_max_reward": _mean([record.max_reward for record in records]),
         "mean_j_guided": _mean([record.j for record in guided]),

@@ -15,7 +15,7 @@ from lerobot_agpd.collect.decider import Decider
 from lerobot_agpd.collect.diagnostics import action_diagnostics, state_diagnostics
 from lerobot_agpd.collect.report import summarise
 from lerobot_agpd.collect.rollout import Rollouts
-from lerobot_agpd.collect.seeds import noise_seed, round_tickets
+from lerobot_agpd.collect.seeds import failed_starts, noise_seed, round_tickets, share_of
 from lerobot_agpd.collect.stopwatch import Stopwatch
 from lerobot_agpd.collect.success import SuccessFilter
 from lerobot_agpd.collect.witness import Witness
@@ -67,6 +67,8 @@ class RoundRunner:
     def tickets(self, number: int, scale: float) -> list[Ticket]:
         """The episodes of this process's share of a round; the same whenever asked."""
         config = self.config
+        earlier = [round_.report for round_ in self.store.rounds()[:number]] if config.retry_fraction else []
+        n_retries = int(config.retry_fraction * share_of(config.episodes, self.rank, self.n_ranks))
         return round_tickets(
             config.episodes,
             self.seed,
@@ -77,6 +79,7 @@ class RoundRunner:
             config.unguided_fraction,
             scale_spread=config.variation.scale_spread,
             max_student_share=config.rollin.max_fraction if config.strategy == "rollin" else 0.0,
+            retries=failed_starts(earlier)[self.rank :: self.n_ranks][:n_retries],
         )
 
     def collect(

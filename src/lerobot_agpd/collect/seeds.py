@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import numpy as np
 
 from lerobot_agpd.collect.config import COLLECTION_SEEDS
@@ -21,6 +24,7 @@ def round_tickets(
     unguided_fraction: float,
     scale_spread: float = 1.0,
     max_student_share: float = 0.0,
+    retries: Sequence[int] = (),
 ) -> list[Ticket]:
     """The episodes of a round of n_episodes that one process collects.
 
@@ -37,19 +41,44 @@ def round_tickets(
         unguided_fraction: share of the episodes whose scale is 0.
         scale_spread: the others' scales are log-uniform in [scale / scale_spread, scale * scale_spread].
         max_student_share: the student's shares of the episodes are uniform in [0, max_student_share).
+        retries: environment seeds from which episodes start again. They take the places of the first ones that the
+            strategy decides; every round varies them anew.
     """
     first = sum(share_of(n_episodes, lower, n_ranks) for lower in range(rank))
     n_episodes = share_of(n_episodes, rank, n_ranks)
     rng = np.random.default_rng(np.random.SeedSequence([seed, rank, round_number]))
     seeds = rng.integers(*COLLECTION_SEEDS, size=n_episodes)
     unguided = np.diff(np.floor((first + np.arange(n_episodes + 1)) * unguided_fraction + 1e-9)) > 0
+    waiting = iter(retries)
     tickets = []
-    for number, (env_seed, alone) in enumerate(zip(seeds, unguided, strict=True)):
-        own = np.random.default_rng([int(env_seed), VARIATION])
+    for number, (fresh, alone) in enumerate(zip(seeds, unguided, strict=True)):
+        again = None if alone else next(waiting, None)
+        env_seed = int(fresh) if again is None else again
+        own = np.random.default_rng([env_seed, VARIATION, *([] if again is None else [round_number])])
         spread, share = scale_spread ** own.uniform(-1, 1), own.uniform(0, 1)
         drawn = 0.0 if alone else float(scale * spread)
-        tickets.append(Ticket(number, int(env_seed), drawn, float(max_student_share * share)))
+        tickets.append(
+            Ticket(number, env_seed, drawn, float(max_student_share * share), retry=again is not None)
+        )
     return tickets
+
+
+def failed_starts(reports: Sequence[Mapping[str, Any]]) -> list[int]:
+    """Environment seeds from which no episode has succeeded, the least often tried first.
+
+    A filter on success thins out the starts at which the teacher fails, and with them what the student is taught
+    about them; trying these again brings them back.
+
+    Args:
+        reports: of the finished rounds, with a record of every episode.
+    """
+    tried: dict[int, int] = {}
+    solved = set()
+    for record in (record for report in reports for record in report["episodes"]):
+        tried[record["seed"]] = tried.get(record["seed"], 0) + 1
+        if record["passed"] or record["trivial"]:
+            solved.add(record["seed"])
+    return sorted((seed for seed in tried if seed not in solved), key=lambda seed: tried[seed])
 
 
 def share_of(n_episodes: int, rank: int, n_ranks: int) -> int:

@@ -58,4 +58,5 @@ class SuccessFilter:
             shift=episode.shift,
             student_steps=episode.student_steps,
             student_alone=episode.student_alone,
+            retry=episode.ticket.retry,
         )

@@ -10,7 +10,7 @@ from lerobot_agpd.collect.report import success_rate
 
 logger = logging.getLogger(__name__)
 
-KINDS = ("guided", "unguided")
+KINDS = ("guided", "unguided", "retried")
 DIAGNOSTICS = {
     "actions": ("rms_to_student", "rms_to_teacher", "kl_to_teacher_median"),
     "states": ("entropy", "coverage"),
@@ -25,7 +25,9 @@ def round_scalars(reports: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     last = reports[-1]
     scalars["scale"] = float(last["scale"])
     for kind in KINDS:
-        rate = success_rate([last[kind]])
+        rate = (
+            success_rate([last[kind]]) if kind in last else None
+        )  # rounds of earlier versions have no retries
         if rate is not None:
             scalars[f"{kind}_success"] = rate
     for key in ("generated", "successful", "kept"):
@@ -45,13 +47,14 @@ def log_round(report: Mapping[str, Any]) -> None:
     rates = {kind: success_rate([report[kind]]) for kind in KINDS}
     shown = {kind: "-" if rate is None else f"{rate:.2f}" for kind, rate in rates.items()}
     logger.info(
-        "round %d: %d generated, %d successful, %d kept; success guided %s, unguided %s; scale %.3g -> %.3g; %.0f s",
+        "round %d: %d generated, %d successful, %d kept; success guided %s, unguided %s, of failed starts %s; scale %.3g -> %.3g; %.0f s",
         report["round"],
         report["generated"],
         report["successful"],
         report["kept"],
         shown["guided"],
         shown["unguided"],
+        shown["retried"],
         report["scale"],
         report["next_scale"],
         sum(report["seconds"].values()),

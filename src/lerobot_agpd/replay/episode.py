@@ -21,12 +21,14 @@ class Ticket:
         seed: the environment's.
         scale: guidance scale, or mixing weight; 0: the teacher as it acts alone.
         student_share: share of the longest possible episode in which the student acts before the teacher does.
+        retry: whether an earlier round's episode from this start has failed.
     """
 
     number: int
     seed: int
     scale: float
     student_share: float = 0.0
+    retry: bool = False
 
     @property
     def guided(self) -> bool:
@@ -91,7 +93,7 @@ class Episode:
         """Read what `save` wrote; the record supplies what is not an array."""
         with np.load(path) as arrays:
             return cls(
-                ticket=Ticket(record.number, record.seed, record.scale),
+                ticket=Ticket(record.number, record.seed, record.scale, retry=record.retry),
                 task=str(arrays["task"]),
                 observations={
                     key.removeprefix("observation/"): arrays[key]
@@ -118,6 +120,7 @@ class EpisodeRecord:
         kept: whether it entered the replay.
         student_steps: steps that the student executed before the teacher took over.
         student_alone: whether the episode ended before the teacher took over.
+        retry: whether an earlier round's episode from this start has failed.
     """
 
     number: int
@@ -133,6 +136,7 @@ class EpisodeRecord:
     shift: float = field(default=float("nan"))
     student_steps: int = 0
     student_alone: bool = False
+    retry: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """A JSON object; NaN becomes null."""
