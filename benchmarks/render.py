@@ -120,14 +120,22 @@ def environments_page(folder: Path) -> str:
     for row in json.loads((folder / "experts.json").read_text()):
         played.setdefault((row["task"], row["episode_length"]), {})[row["skill"]] = row
     skills = sorted({skill for cells in played.values() for skill in cells}, reverse=True)
-    header = ("", "steps", *(f"skill {skill:g}" for skill in skills))
+    header = ("", "episode limit", *(f"skill {skill:g}" for skill in skills))
     lines = [header, tuple("---" for _ in header)]
     for (task, episode_length), cells in played.items():
         lines.append((task, str(episode_length), *(operator_cell(cells[skill]) for skill in skills)))
     speed = json.loads((folder / "speed.json").read_text())
     rows = [("", "steps per second", "least", "most"), ("---",) * 4]
     for name, row in speed["rows"].items():
-        rows.append((name, *(f"{row[key]:.3g}" for key in ("steps_per_second", "least", "most"))))
+        rows.append(
+            (
+                name,
+                *(
+                    f"{row[key]:.{0 if row[key] > 100 else 1}f}"
+                    for key in ("steps_per_second", "least", "most")
+                ),
+            )
+        )
     experts, speeds = ("\n".join("| " + " | ".join(line) + " |" for line in table) for table in (lines, rows))
     text = (folder / "README.md").read_text().rstrip()
     return text.format(experts=experts, speeds=speeds, ratio=f"{speed['aloha_ratio']:.1f}") + "\n"

@@ -1,7 +1,7 @@
 """Control steps per second of the environment types, on one core: speed.json beside this file.
 
-Process time, random actions, resets left out. ALOHA at the image size of LeRobot's own type is measured in turns with it
-and given as a ratio, too.
+Process time, resets left out. Actions are random; ALOHA, whose simulation breaks down under those, stays where it is. It is
+measured in turns with LeRobot's own type, at that one's image size, and given as a ratio, too.
 
 usage: MUJOCO_GL=egl python benchmarks/environments/speed.py
 """
@@ -22,6 +22,7 @@ from lerobot_agpd.envs.robomimic import RobomimicEnvConfig
 
 RESULT = Path(__file__).parent / "speed.json"
 REPETITIONS = 5
+DOOR = "AdroitHandDoor-v1"
 OURS, THEIRS = (f"{name}, pixels_agent_pos, 640x480" for name in ("aloha_state", "LeRobot's aloha"))
 
 
@@ -39,8 +40,9 @@ def environments() -> dict[str, tuple]:
     return {
         "FetchPickAndPlace-v4, state": (GymnasiumRoboticsEnv().make_single, 50),
         "FetchPickAndPlace-v4, 96x96": (GymnasiumRoboticsEnv(**pixels).make_single, 20),
-        "FetchPickAndPlace-v4, 96x96, no shadows": (
-            GymnasiumRoboticsEnv(**pixels, shadows=False).make_single,
+        "AdroitHandDoor-v1, 96x96": (GymnasiumRoboticsEnv(task=DOOR, **pixels).make_single, 20),
+        "AdroitHandDoor-v1, 96x96, no shadows": (
+            GymnasiumRoboticsEnv(task=DOOR, **pixels, shadows=False).make_single,
             20,
         ),
         "lift, state": (RobomimicEnvConfig(task="lift").make_single, 30),
@@ -62,9 +64,11 @@ def environments() -> dict[str, tuple]:
 
 def seconds_per_step(env: gym.Env, n_steps: int, seed: int) -> float:
     """Process time of a step, its image included."""
-    env.reset(seed=seed)
+    observation, _ = env.reset(seed=seed)
     env.action_space.seed(seed)
     actions = [env.action_space.sample() for _ in range(n_steps)]
+    if observation["agent_pos"].shape == env.action_space.shape:  # ALOHA: joint targets
+        actions = [observation["agent_pos"]] * n_steps
     begin = time.process_time()
     for action in actions:
         env.step(action)

@@ -79,7 +79,7 @@ class GymnasiumRoboticsEnv(SingleEnvConfig, EnvConfig):
     render_mode: str = "rgb_array"  # gymnasium's render mode; nothing is rendered unless asked for
     visualization_width: int = 480  # width of rendered frames, pixels
     visualization_height: int = 480  # height of rendered frames, pixels
-    shadows: bool = True  # draw shadows; without a GPU an image is up to ten times faster without
+    shadows: bool = True  # draw shadows; without a GPU Adroit's images are several times faster without
     tasks_to_complete: list[str] | None = (
         None  # FrankaKitchen-v1 only: what success asks for, e.g. "[kettle]"
     )
