@@ -1,6 +1,7 @@
 # Everything a stranger needs: `make quickstart` and `make test` set up their own environment.
 .DEFAULT_GOAL := help
-UV := python3 -m uv
+# uv as it is installed, or in a folder of its own: many systems let nobody install into their Python (PEP 668).
+UV := $(shell uv --version >/dev/null 2>&1 && echo uv || echo .uv/bin/uv)
 RUN := $(UV) run --frozen --all-extras
 
 .PHONY: help setup quickstart test test-fast lint
@@ -8,8 +9,10 @@ RUN := $(UV) run --frozen --all-extras
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
 
-setup:  ## install the package with all extras into .venv (needs Python 3.12)
-	@python3 -m uv --version >/dev/null 2>&1 || python3 -m pip install --quiet uv
+.uv/bin/uv:
+	@python3 -m venv .uv && .uv/bin/python -m pip install --quiet uv
+
+setup: $(filter .uv/bin/uv,$(UV))  ## install the package with all extras into .venv (needs Python 3.12)
 	@$(UV) sync --frozen --all-extras
 
 quickstart: setup  ## distil a teacher on FetchPickAndPlace, offline, in a few minutes
