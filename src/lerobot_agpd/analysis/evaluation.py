@@ -61,10 +61,26 @@ class Environments:
 class Checkpoint:
     """A policy with its processors, ready to act."""
 
-    def __init__(self, path: Path | str, device: str):
-        """Load from a folder or Hub repository."""
-        config = PreTrainedConfig.from_pretrained(path)
+    def __init__(self, path: Path | str, device: str, n_action_steps: int | None = None):
+        """Load from a folder or Hub repository.
+
+        Args:
+            path: of the checkpoint.
+            device: where it runs.
+            n_action_steps: steps executed per prediction; None: the checkpoint's.
+
+        Raises:
+            ValueError: if it cannot execute that many.
+        """
+        config: Any = PreTrainedConfig.from_pretrained(path)
         config.device = device
+        if n_action_steps is not None:
+            if not 1 <= n_action_steps <= config.n_action_steps:
+                raise ValueError(
+                    f"n_action_steps={n_action_steps}: {path} was trained to execute {config.n_action_steps} steps per "
+                    "prediction; it can execute fewer, at least 1, not more"
+                )
+            config.n_action_steps = n_action_steps
         config.pretrained_path = Path(path)
         self.config = config
         self.policy: PreTrainedPolicy = get_policy_class(config.type).from_pretrained(path, config=config)

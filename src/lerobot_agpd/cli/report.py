@@ -33,6 +33,9 @@ class ReportConfig:
     )  # name to a single checkpoint, such as the teacher
     episodes: int = 200  # episodes of the final evaluation
     curve_episodes: int = 0  # episodes at every earlier checkpoint; 0: no learning curve
+    n_action_steps: list[int] = field(
+        default_factory=list
+    )  # steps executed per prediction, e.g. "[8,2]": one row each; default: the checkpoint's
     batch_size: int = 50  # environments side by side
     seed: int = 100_000  # first environment seed; training and collection stay away from 100000 to 999999
     device: str = "cpu"  # where policies run
@@ -45,33 +48,48 @@ class ReportConfig:
             if not Path(path).exists():
                 raise FileNotFoundError(f"'{name}': {path} does not exist")
 
+    @property
+    def replanning(self) -> list[int | None]:
+        """Steps executed per prediction, one row each; None is the checkpoint's own number."""
+        return [*self.n_action_steps] or [None]
 
-def evaluate_run(name: str, run: Path, environments: Environments, config: ReportConfig) -> MethodResult:
+
+def evaluate_run(
+    name: str, run: Path, environments: Environments, config: ReportConfig
+) -> list[MethodResult]:
     """Evaluate a run's last checkpoint, and the earlier ones for its learning curve."""
     steps = checkpoint_steps(run)
     last = max(steps)
     curve = {}
     for step, path in steps.items():
         if config.curve_episodes and step != last:
-            checkpoint = Checkpoint(path, config.device)
+            checkpoint = Checkpoint(path, config.device, config.replanning[0])
             curve[step] = checkpoint.evaluate(environments, config.curve_episodes, config.seed)
             logger.info("evaluated %s at step %d: %s", name, step, success_rate(curve[step].successes))
-    result = evaluate_policy(name, steps[last], environments, config)
+    results = evaluate_policy(name, steps[last], environments, config)
     if curve:
-        result.curve = {**curve, last: result.final}
+        results[0].curve = {**curve, last: results[0].final}
     rounds = ReplayStore(run / "agpd").reports()
     if rounds:
         keys = ("generated", "successful", "kept")
-        result.collection = {key: sum(entry[key] for entry in rounds) for key in keys} | {"rounds": rounds}
-    return result
+        results[0].collection = {key: sum(entry[key] for entry in rounds) for key in keys} | {
+            "rounds": rounds
+        }
+    return results
 
 
-def evaluate_policy(name: str, path: Path, environments: Environments, config: ReportConfig) -> MethodResult:
-    """Evaluate one checkpoint."""
-    checkpoint = Checkpoint(path, config.device)
-    final = checkpoint.evaluate(environments, config.episodes, config.seed)
-    logger.info("evaluated %s: success %s", name, success_rate(final.successes))
-    return MethodResult(name, final, checkpoint.latency())
+def evaluate_policy(
+    name: str, path: Path, environments: Environments, config: ReportConfig
+) -> list[MethodResult]:
+    """Evaluate one checkpoint, once for every number of steps that it shall execute per prediction."""
+    results = []
+    for n_steps in config.replanning:
+        checkpoint = Checkpoint(path, config.device, n_steps)
+        final = checkpoint.evaluate(environments, config.episodes, config.seed)
+        row = name if n_steps is None else f"{name}, {n_steps} step{'s' * (n_steps != 1)} per chunk"
+        logger.info("evaluated %s: success %s", row, success_rate(final.successes))
+        results.append(MethodResult(row, final, checkpoint.latency()))
+    return results
 
 
 def show(results: list[MethodResult]) -> None:
@@ -87,9 +105,15 @@ def run(config: ReportConfig) -> None:
     """Evaluate, write and show."""
     with Environments(config.env, min(config.batch_size, config.episodes)) as environments:
         results = [
-            evaluate_policy(name, path, environments, config) for name, path in config.policies.items()
+            result
+            for name, path in config.policies.items()
+            for result in evaluate_policy(name, path, environments, config)
         ]
-        results += [evaluate_run(name, path, environments, config) for name, path in config.runs.items()]
+        results += [
+            result
+            for name, path in config.runs.items()
+            for result in evaluate_run(name, path, environments, config)
+        ]
     rounds: list[dict[str, Any]] = next(
         (result.collection["rounds"] for result in results if result.collection), []
     )
