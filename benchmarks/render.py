@@ -17,13 +17,26 @@ from lerobot_agpd.analysis.frontier import NAMES
 from lerobot_agpd.analysis.report import MethodResult, markdown
 from lerobot_agpd.analysis.statistics import success_rate
 from lerobot_agpd.comparison.curves import draw_curves
-from lerobot_agpd.comparison.matrix import load_matrix
+from lerobot_agpd.comparison.matrix import MEASURES, Matrix, load_matrix
 from lerobot_agpd.comparison.results import RunResult, read_result
 from lerobot_agpd.comparison.runs import expand
 from lerobot_agpd.comparison.table import report
 
 ROOT = Path(__file__).parent.parent
 COMPARISON = ROOT / "benchmarks" / "comparison"
+SUMMARY = {
+    "bc": "cloning",
+    "pd": "PD",
+    "dagger": "DAgger",
+    "guided": "guided",
+    "agpd": "AGPD",
+    "teacher": "teacher",
+}
+"""Methods of the README's table, and what it calls them."""
+
+Results = dict[str, dict[str, list[RunResult]]]
+"""Task and method to results, one per training seed."""
+
 COLUMNS = ("round", "scale", "guided", "unguided", "generated", "kept", "shift in sigmas", "seconds")
 
 
@@ -148,17 +161,17 @@ def operator_cell(row: dict) -> str:
     return f"{success_rate(row['successes'])}, N = {len(row['successes'])}; {median}"
 
 
-def comparison_page(path: Path, draw: bool) -> str | None:
-    """The page of one matrix; None if nothing of it is committed. Its learning curves are drawn beside the results."""
+def committed(path: Path) -> tuple[Matrix, Results, list[str]] | None:
+    """A matrix, its committed results and the names of missing runs; None if nothing of it is committed."""
     results_folder = COMPARISON / "results" / path.stem
-    committed = sorted(results_folder.glob("*/*/seed-*/run.json"))
-    if not committed:
+    files = sorted(results_folder.glob("*/*/seed-*/run.json"))
+    if not files:
         return None
-    root = json.loads(committed[0].read_text())["flags"]["dataset.root"]
+    root = json.loads(files[0].read_text())["flags"]["dataset.root"]
     os.environ["AGPD_RUNS"] = root.rpartition("/data/")[0]  # where the runs were made: part of their flags
     matrix = load_matrix(path)
     matrix.output = results_folder
-    found: dict[str, dict[str, list[RunResult]]] = {}
+    found: Results = {}
     missing = []
     for run in expand(matrix):
         result = read_result(run, matrix)
@@ -167,9 +180,14 @@ def comparison_page(path: Path, draw: bool) -> str | None:
         elif run.folder.parent.exists():  # a method that was begun; the others are not part of the page
             missing.append(run.name)
     order = list(matrix.methods)
-    found = {
+    ordered = {
         task: {name: methods[name] for name in order if name in methods} for task, methods in found.items()
     }
+    return matrix, ordered, missing
+
+
+def comparison_page(path: Path, matrix: Matrix, found: Results, missing: list[str], draw: bool) -> str:
+    """The page of one matrix; its learning curves are drawn beside the results."""
     parts = [(COMPARISON / f"{path.stem}.md").read_text().rstrip(), report(matrix, found, missing).rstrip()]
     for task, methods in found.items():
         picture = matrix.output / f"curves-{task}.png"
@@ -180,17 +198,41 @@ def comparison_page(path: Path, draw: bool) -> str | None:
     return "\n\n".join(parts) + "\n"
 
 
-def readme(text: str, folder: Path) -> str:
-    table = markdown(results(folder)).rstrip()
-    pattern = re.compile(rf"(<!-- {folder.name}-results -->\n).*?(<!-- end -->)", re.DOTALL)
+def summary(comparisons: dict[Path, tuple[Matrix, Results, list[str]]]) -> str:
+    """One row per task and one column per method: the task's measure at the last checkpoint."""
+    lines = [("", *SUMMARY.values()), tuple("---" for _ in range(len(SUMMARY) + 1))]
+    for path, (matrix, found, _) in comparisons.items():
+        for task, methods in found.items():
+            entry = matrix.tasks[task]
+            cells = [summary_cell(methods.get(name, []), entry.measure) for name in SUMMARY]
+            measure = "" if entry.measure == "success" else ", mean max reward"
+            lines.append(
+                (f"[{entry.title or task}](docs/results/comparison-{path.stem}.md){measure}", *cells)
+            )
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def summary_cell(runs: list[RunResult], measure: str) -> str:
+    """The mean over all training seeds, how many there are, and the spread of their means if there are several."""
+    if not runs:
+        return ""
+    means = [float(np.mean(getattr(run.finals["last"], MEASURES[measure]))) for run in runs]
+    spread = "" if len(means) == 1 else f" ({min(means):.2f} to {max(means):.2f}, {len(means)} seeds)"
+    return f"{np.mean(means):.2f}{spread}"
+
+
+def filled(text: str, name: str, table: str) -> str:
+    """A text whose table between `<!-- name-results -->` and `<!-- end -->` is exchanged."""
+    pattern = re.compile(rf"(<!-- {name}-results -->\n).*?(<!-- end -->)", re.DOTALL)
     return pattern.sub(lambda match: f"{match[1]}{table}\n{match[2]}", text)
 
 
 def main() -> None:
-    pages = {ROOT / "README.md": (ROOT / "README.md").read_text()}
+    readme = ROOT / "README.md"
+    pages = {readme: readme.read_text()}
     for folder in sorted(path.parent for path in (ROOT / "benchmarks").glob("*/report.json")):
         pages[ROOT / "docs" / "results" / f"{folder.name}.md"] = page(folder)
-        pages[ROOT / "README.md"] = readme(pages[ROOT / "README.md"], folder)
+        pages[readme] = filled(pages[readme], folder.name, markdown(results(folder)).rstrip())
     for path in sorted((ROOT / "benchmarks" / "latency").glob("latency-*.json")):
         pages[ROOT / "docs" / "results" / f"{path.stem}.md"] = latency_page(path)
     for folder in sorted(path.parent for path in (ROOT / "benchmarks" / "diversity").glob("*/sweep.json")):
@@ -199,10 +241,12 @@ def main() -> None:
         pages[ROOT / "docs" / "results" / "environments.md"] = environments_page(
             ROOT / "benchmarks" / "environments"
         )
-    for path in sorted(COMPARISON.glob("*.yaml")):
-        content = comparison_page(path, draw="--check" not in sys.argv)
-        if content is not None:
-            pages[ROOT / "docs" / "results" / f"comparison-{path.stem}.md"] = content
+    found = {path: committed(path) for path in sorted(COMPARISON.glob("*.yaml"))}
+    comparisons = {path: entry for path, entry in found.items() if entry is not None}
+    for path, entry in comparisons.items():
+        page_path = ROOT / "docs" / "results" / f"comparison-{path.stem}.md"
+        pages[page_path] = comparison_page(path, *entry, draw="--check" not in sys.argv)
+    pages[readme] = filled(pages[readme], "comparison", summary(comparisons))
     stale = [path for path, text in pages.items() if not path.exists() or path.read_text() != text]
     if "--check" in sys.argv:
         sys.exit(f"out of date, run benchmarks/render.py: {[str(p) for p in stale]}" if stale else 0)

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # The Push-T teacher: residual-MLP diffusion policy on all 206 human episodes (62 minutes on one core of a busy machine).
-# usage: benchmarks/pusht/teacher.sh DATASET_ROOT OUTPUT_DIR [more lerobot-train flags]
+# usage: benchmarks/pusht_teacher/teacher.sh DATASET_ROOT OUTPUT_DIR [more lerobot-train flags]
 set -euo pipefail
 export HF_HUB_OFFLINE=1 OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"
 root=$1 output=$2
