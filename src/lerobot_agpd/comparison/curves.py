@@ -51,7 +51,6 @@ def _draw_method(axes: Axes, name: str, runs: Sequence[RunResult], measure: str,
     centre = values.mean(axis=0)
     axes.plot(steps, centre, color=colour, label=name)
     axes.fill_between(steps, values.min(axis=0), values.max(axis=0), color=colour, alpha=0.15, linewidth=0)
-    top = int(
-        np.flatnonzero(centre == centre.max())[-1]
-    )  # of equal ones the latest, as the best checkpoint is chosen
+    # Of equal ones the latest, as the best checkpoint is chosen.
+    top = int(np.flatnonzero(centre == centre.max())[-1])
     axes.plot(steps[top], centre[top], "^", color=colour, markersize=9, markeredgecolor="white")

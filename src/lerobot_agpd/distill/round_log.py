@@ -25,9 +25,8 @@ def round_scalars(reports: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     last = reports[-1]
     scalars["scale"] = float(last["scale"])
     for kind in KINDS:
-        rate = (
-            success_rate([last[kind]]) if kind in last else None
-        )  # rounds of earlier versions have no retries
+        # Rounds of earlier versions have no retries.
+        rate = success_rate([last[kind]]) if kind in last else None
         if rate is not None:
             scalars[f"{kind}_success"] = rate
     for key in ("generated", "successful", "kept"):
