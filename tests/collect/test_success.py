@@ -77,7 +77,16 @@ def test_silent_environment_is_refused():
 
 
 def test_filter_takes_its_flags():
-    assert SuccessFilter.from_config(CollectConfig(min_reward=0.7, min_length=9)) == SuccessFilter(0.7, 9)
+    config = CollectConfig(min_reward=0.7, min_length=9, keep_failures=True)
+    assert SuccessFilter.from_config(config) == SuccessFilter(0.7, 9, True)
+
+
+@pytest.mark.parametrize(
+    ("successes", "kept"), [([0, 0, 0], True), ([0, 0, 1], True), ([1, 0, 0], False), ([0, 0], False)]
+)
+def test_failures_are_kept_if_asked_for_but_nothing_trivial(successes, kept):
+    record = SuccessFilter(None, 3, keep_failures=True).judge(episode([0.0] * len(successes), successes))
+    assert (record.passed, record.kept) == (bool(successes[-1]), kept)
 
 
 @pytest.mark.parametrize(

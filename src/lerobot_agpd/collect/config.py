@@ -159,6 +159,9 @@ class CollectConfig:
     min_length: int = (
         2  # drop episodes with fewer steps; those that pass at their first step are dropped anyway
     )
+    keep_failures: bool = (
+        False  # keep episodes that fail too, for imitation of the teacher's own chunks (replay.relabel=all)
+    )
     n_action_steps: int | None = (
         None  # steps executed per decision; default: the smaller of the teacher's and the student's
     )

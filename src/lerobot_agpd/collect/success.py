@@ -16,15 +16,17 @@ class SuccessFilter:
         min_reward: an episode passes if its largest reward reaches this; None: if the environment says
             `is_success` at its last step.
         min_length: shorter episodes are trivial, and so are those whose first step already passes.
+        keep_failures: whether episodes that fail enter too, as in DAgger (arXiv:1011.0686), which has no filter.
     """
 
     min_reward: float | None
     min_length: int
+    keep_failures: bool = False
 
     @classmethod
     def from_config(cls, config: CollectConfig) -> SuccessFilter:
-        """The filter of `--policy.collect.min_reward` and `min_length`."""
-        return cls(min_reward=config.min_reward, min_length=config.min_length)
+        """The filter of `--policy.collect.min_reward`, `min_length` and `keep_failures`."""
+        return cls(config.min_reward, config.min_length, config.keep_failures)
 
     def judge(self, episode: Episode) -> EpisodeRecord:
         """Pass or fail, keep or drop; an episode that the student finished alone teaches it nothing.
@@ -53,7 +55,7 @@ class SuccessFilter:
             success=episode.success,
             passed=passed,
             trivial=trivial,
-            kept=passed and not trivial and not episode.student_alone,
+            kept=(passed or self.keep_failures) and not trivial and not episode.student_alone,
             j=episode.j,
             shift=episode.shift,
             student_steps=episode.student_steps,
