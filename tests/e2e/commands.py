@@ -1,10 +1,17 @@
 """Commands and flags of the end-to-end tests: tiny networks, real environments."""
 
 import importlib.metadata
+import multiprocessing
 import os
 import subprocess
 import sys
+import tempfile
+from multiprocessing.process import BaseProcess
 from pathlib import Path
+
+import torch
+
+from lerobot_agpd.plugin import FORKSERVER_PRELOAD
 
 BIN = Path(sys.executable).parent
 
@@ -48,27 +55,48 @@ def environment(**extra: str) -> dict[str, str]:
     return {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "MUJOCO_GL": "egl", **extra}
 
 
-def start(*command: object, log: Path) -> subprocess.Popen[bytes]:
-    """Start one of the environment's commands in the background."""
-    words = [str(BIN / str(command[0])), *map(str, command[1:])]
-    return subprocess.Popen(words, stdout=log.open("wb"), stderr=subprocess.STDOUT, env=environment())
-
-
-def run(*command: object, expect_failure: bool = False) -> str:
-    """Run a command to its end and return what it printed."""
-    words = [str(BIN / str(command[0])), *map(str, command[1:])]
-    done = subprocess.run(words, capture_output=True, text=True, env=environment(), timeout=900)
-    output = done.stdout + done.stderr
-    assert (done.returncode != 0) == expect_failure, output[-5000:]
-    return output
-
-
 def dataset_flags(root: Path) -> list[str]:
     return ["--dataset.repo_id=local/test", f"--dataset.root={root}"]
 
 
+# ---- commands in processes of their own, forked from one that has imported LeRobot ----
+
+PROCESSES = multiprocessing.get_context("forkserver")
+
+
+def start(command: str, *flags: object, log: Path) -> BaseProcess:
+    """Start one of the console commands in the background; what it prints goes to `log`."""
+    multiprocessing.set_forkserver_preload([*FORKSERVER_PRELOAD, "lerobot.scripts.lerobot_train"])
+    process = PROCESSES.Process(target=_run_logged, args=(log, command, *map(str, flags)))
+    process.start()
+    return process
+
+
+def run(command: str, *flags: object) -> str:
+    """Run one of the console commands to its end and return what it printed."""
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder) / "log"
+        process = start(command, *flags, log=log)
+        process.join(timeout=900)
+        output = log.read_text()
+    assert process.exitcode == 0, output[-5000:]
+    return output
+
+
+def _run_logged(log: Path, command: str, *flags: str) -> None:
+    with log.open("wb") as file:
+        for stream in (1, 2):
+            os.dup2(file.fileno(), stream)
+    os.environ.update(environment())
+    torch.set_num_threads(1)
+    run_here(command, *flags)
+
+
+# ---- commands in this process ----
+
+
 def run_here(command: str, *flags: object) -> None:
-    """Run one of the console commands in this process, which saves importing everything anew."""
+    """Run one of the console commands in this process."""
     entry_points = importlib.metadata.entry_points(group="console_scripts", name=command)
     main = next(iter(entry_points)).load()
     argv, sys.argv = sys.argv, [command, *map(str, flags)]
@@ -76,3 +104,13 @@ def run_here(command: str, *flags: object) -> None:
         main()
     finally:
         sys.argv = argv
+
+
+# ---- commands from nothing, as in a shell ----
+
+
+def run_afresh(command: str, *arguments: object) -> None:
+    """Run one of the environment's programs."""
+    words = [str(BIN / command), *map(str, arguments)]
+    done = subprocess.run(words, capture_output=True, text=True, env=environment(), timeout=900)
+    assert done.returncode == 0, (done.stdout + done.stderr)[-5000:]

@@ -1,16 +1,13 @@
 """Train, kill, resume, evaluate and export on FetchPickAndPlace, through LeRobot's own commands."""
 
 import json
-import os
 import shutil
-import signal
-import subprocess
 import time
 from pathlib import Path
 
 import pytest
 import torch
-from commands import BIN, PICK, TINY_STUDENT, dataset_flags, environment, run, start
+from commands import PICK, TINY_STUDENT, dataset_flags, run, run_afresh, start
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors import safe_open
 from safetensors.torch import load_file
@@ -56,11 +53,11 @@ def test_killed_run_is_resumed_evaluated_and_exported(
     spool = first / "agpd" / "round-001.partial" / "spool-0.jsonl"
     deadline = time.monotonic() + 600
     while len(records(spool)) < 3:
-        assert process.poll() is None, (tmp_path / "first.log").read_text()[-5000:]
+        assert process.is_alive(), (tmp_path / "first.log").read_text()[-5000:]
         assert time.monotonic() < deadline
         time.sleep(0.02)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
+    process.kill()  # SIGKILL
+    process.join()
     spooled = records(spool)
     assert 3 <= len(spooled) < 12, "killed in the middle of a round"
 
@@ -115,7 +112,7 @@ def test_killed_run_is_resumed_evaluated_and_exported(
         "assert policy.select_action(batch).shape == (1, 4)\n"
         "assert not any(name.startswith('lerobot_agpd') for name in sys.modules)\n"
     )
-    subprocess.run([BIN / "python", "-c", load], check=True, env=environment())
+    run_afresh("python", "-c", load)
 
 
 def test_resuming_changes_nothing(fetch_demos: Path, fetch_teacher: Path, tmp_path: Path) -> None:
@@ -154,7 +151,7 @@ def test_resuming_changes_nothing(fetch_demos: Path, fetch_teacher: Path, tmp_pa
 
 def test_two_processes_share_a_round(fetch_demos: Path, fetch_teacher: Path, tmp_path: Path) -> None:
     output = tmp_path / "run"
-    run(
+    run_afresh(
         "torchrun",
         "--standalone",
         "--nproc_per_node=2",

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from commands import TINY_STUDENT, TINY_TEACHER, dataset_flags, run
+from commands import TINY_STUDENT, TINY_TEACHER, dataset_flags, run, run_afresh
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from pusht import N_STEPS, record
 
@@ -22,9 +22,9 @@ PIXELS = ["--env.type=pusht", "--env.obs_type=pixels_agent_pos", f"--env.episode
 
 
 def test_cloning_and_asynchronous_evaluation(tmp_path: Path) -> None:
-    """LeRobot's forkserver workers know gym_pusht only because the plugin preloads it."""
+    """As in a shell: LeRobot's forkserver workers know gym_pusht only because the plugin preloads it."""
     demos = record(tmp_path / "demos", pixels=False)
-    run(
+    run_afresh(
         "lerobot-train",
         *TINY_STUDENT,
         *dataset_flags(demos),
@@ -35,7 +35,7 @@ def test_cloning_and_asynchronous_evaluation(tmp_path: Path) -> None:
         "--steps=10",
         f"--output_dir={tmp_path / 'run'}",
     )
-    run(
+    run_afresh(
         "lerobot-eval",
         f"--policy.path={tmp_path / 'run' / 'checkpoints' / 'last' / 'pretrained_model'}",
         "--policy.device=cpu",
