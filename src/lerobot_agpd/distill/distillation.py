@@ -27,26 +27,20 @@ from torch import Tensor
 
 from lerobot_agpd.collect.decider import Decider
 from lerobot_agpd.collect.report import success_rate
-from lerobot_agpd.collect.round import RoundRunner
 from lerobot_agpd.collect.seeds import noise_seed
 from lerobot_agpd.collect.strategies import round_strength
 from lerobot_agpd.distill.adversary import adversary_terms
-from lerobot_agpd.distill.environment import check_environment_fits, run_environment
-from lerobot_agpd.distill.guided import Proposer, future_steps, present_step
-from lerobot_agpd.distill.own_teacher import OwnTeacher
-from lerobot_agpd.distill.relabel import TeacherChunks
+from lerobot_agpd.distill.guided import Proposer, present_step
+from lerobot_agpd.distill.parts import make_own_teacher, make_rounds, make_teacher, make_teacher_chunks
 from lerobot_agpd.distill.round_log import log_round, round_scalars
 from lerobot_agpd.distill.schedule import due_round
-from lerobot_agpd.distill.state import DistillationState, replay_root
+from lerobot_agpd.distill.state import DistillationState
 from lerobot_agpd.guidance.controller import next_scale
-from lerobot_agpd.guidance.loading import check_teacher_fits, load_teacher
 from lerobot_agpd.guidance.representation import reconstruction_loss
-from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.replay.memory import Batch, FrameMemory
 from lerobot_agpd.replay.normalisation import Statistics
 from lerobot_agpd.replay.replay import ROW, Replay
-from lerobot_agpd.replay.store import ReplayStore
-from lerobot_agpd.run import barrier, process_rank, this_run, world_size
+from lerobot_agpd.run import barrier, process_rank, this_run
 
 if TYPE_CHECKING:
     from lerobot_agpd.distill.student import DistilledStudent
@@ -81,83 +75,18 @@ class Distillation:
         self.config = student.config
         self.run = this_run()
         self.seed = seed
-        self.rank, self.n_ranks = process_rank(), world_size()
+        self.rank = process_rank()
         self.state = DistillationState.restore(self.config, self.run)
         memory = FrameMemory(self.config, dataset_meta, dataset_stats)
         self.demonstrations = memory.dataset.meta
         self.replay = Replay(memory, self.config, self.config.replay.collected_share)
         self.replay.seen_episodes.update(self.state.seen_episodes)
-        self.own_teacher = self._make_own_teacher()
-        self.teacher = self._load_teacher()
-        self.rounds = self._make_rounds()
-        self.teacher_chunks = self._make_teacher_chunks()
+        self.own_teacher = make_own_teacher(student, self.state)
+        self.teacher = None if self.own_teacher else make_teacher(student, self.demonstrations)
+        self.rounds = make_rounds(self.config, self.run, self.state, self.demonstrations, self.teacher, seed)
+        self.teacher_chunks = make_teacher_chunks(self.config, self.teacher, self.replay, seed)
         self.reports: list[Mapping[str, Any]] = []
         self._adopt_finished_rounds()
-
-    # ---- setting up ----
-
-    @property
-    def needs_teacher(self) -> bool:
-        """Whether any part of the method uses a teacher of its own; in self-distillation none does."""
-        config = self.config
-        used = config.collect.enabled or config.adversary.weight > 0 or config.replay.relabel != "none"
-        return used and self.own_teacher is None
-
-    def _make_own_teacher(self) -> OwnTeacher | None:
-        """Without a teacher's path, a student that can teach itself does (Table 1)."""
-        if self.config.teacher.path or not self.student.can_teach_itself:
-            return None
-        if self.config.replay.relabel != "none":
-            raise ValueError(
-                f"--policy.replay.relabel={self.config.replay.relabel} needs a teacher (--policy.teacher.path); in "
-                "self-distillation the only one is the student"
-            )
-        if self.config.adversary.weight > 0 and not self.config.collect.enabled:
-            raise ValueError(
-                f"--policy.adversary.weight={self.config.adversary.weight} needs collected episodes: in "
-                "self-distillation the adversary compares with them, and no round is to be collected; set it to 0, or "
-                "--policy.collect.every above 0, or give a teacher (--policy.teacher.path)"
-            )
-        own_teacher = OwnTeacher(self.student)
-        if self.state.checkpoint is not None:
-            own_teacher.restore(Path(self.state.checkpoint))
-        return own_teacher
-
-    def _load_teacher(self) -> Teacher | None:
-        if not self.needs_teacher:
-            return None
-        teacher = load_teacher(self.config.teacher, self.config.device)
-        check_teacher_fits(
-            teacher,
-            self.student.demonstrated_features(self.demonstrations),
-            self.config.action_feature,
-            self.config.guidance if self.config.collect.guides else None,
-        )
-        return teacher
-
-    def _make_rounds(self) -> RoundRunner | None:
-        if not self.config.collect.enabled:
-            return None
-        env_config = run_environment(self.config.collect, self.run)
-        check_environment_fits(env_config, self.config, self.teacher)
-        root = replay_root(self.config.replay, self.run, self.state)
-        self.state.replay_root = str(root)
-        return RoundRunner(
-            store=ReplayStore(root),
-            env_config=env_config,
-            policy_config=self.config,
-            demonstrations=self.demonstrations,
-            seed=self.seed,
-            rank=self.rank,
-            n_ranks=self.n_ranks,
-        )
-
-    def _make_teacher_chunks(self) -> TeacherChunks | None:
-        if self.teacher is None or (
-            self.config.adversary.weight == 0 and self.config.replay.relabel == "none"
-        ):
-            return None
-        return TeacherChunks(self.teacher, self.replay, future_steps(self.config), self.seed)
 
     def _adopt_finished_rounds(self) -> None:
         """Load the rounds on disk: those of the checkpoint, and those finished after it was written."""
