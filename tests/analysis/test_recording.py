@@ -4,16 +4,9 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from lerobot_agpd.analysis.recording import (
-    TIMELINE,
-    Chunks,
-    DecisionRecord,
-    RolloutRecord,
-    blueprint,
-    draw_still,
-    layout,
-    log_rollout,
-)
+from lerobot_agpd.analysis.recording import Chunks, DecisionRecord, RolloutRecord
+from lerobot_agpd.analysis.rerun_log import TIMELINE, blueprint, layout, log_rollout
+from lerobot_agpd.analysis.still import draw_still
 
 RrdReader = pytest.importorskip("rerun.experimental").RrdReader
 

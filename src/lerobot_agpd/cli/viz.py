@@ -19,14 +19,9 @@ from lerobot.utils.utils import init_logging
 from rich.console import Console
 from rich.table import Table
 
-from lerobot_agpd.analysis.recording import (
-    Array,
-    RolloutRecord,
-    blueprint,
-    draw_still,
-    layout,
-    log_rollout,
-)
+from lerobot_agpd.analysis.recording import Array, RolloutRecord
+from lerobot_agpd.analysis.rerun_log import blueprint, layout, log_rollout
+from lerobot_agpd.analysis.still import draw_still
 from lerobot_agpd.collect.config import EVALUATION_SEEDS
 from lerobot_agpd.collect.deciders.teacher import GuidedTeacher
 from lerobot_agpd.collect.recorders import DecisionRecorder, FrameRecorder
