@@ -127,7 +127,10 @@ def test_the_flags_of_committed_matrices_exist(path, monkeypatch, tmp_path):
     monkeypatch.setenv("AGPD_RUNS", str(tmp_path))
     monkeypatch.chdir(ROOT)
     matrix = load_matrix(path)
-    for run in expand(matrix, seeds=matrix.seeds[:1]):
+    tasks, methods, seeds = list(matrix.tasks), list(matrix.methods), matrix.seeds[:1]
+    every_method = expand(matrix, tasks=tasks[:1], seeds=seeds)
+    every_task = expand(matrix, tasks=tasks[1:], methods=methods[:1], seeds=seeds) if tasks[1:] else []
+    for run in every_method + every_task:
         environment(matrix.tasks[run.task])
         if not run.policy:
             parse_flags(run.words)
