@@ -30,6 +30,13 @@ def test_teacher_alone_is_at_no_distance():
     assert found["rms_to_student"] == found["rms_teacher_to_student"] > 0
 
 
+@pytest.mark.parametrize("spread", [0.0, 0.5])
+def test_spread_of_the_teacher_is_that_of_its_samples(spread):
+    decider = TeacherAlone(make_pair(NoisyTeacher(spread)), noise())
+    found = action_diagnostics(decider, histories(), 0.0, samples=400, seed=1)
+    assert found["teacher_spread"] == pytest.approx(spread, rel=0.05)
+
+
 def test_guided_teacher_lies_where_its_scale_says():
     """Scale 0.25 carries the toy teacher a quarter of the way, whatever its noise."""
     found = action_diagnostics(guided(), histories(), 0.25, samples=8, seed=1)

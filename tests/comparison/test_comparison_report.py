@@ -114,7 +114,7 @@ def test_collection_rounds_are_pooled_and_averaged(compared):
     )
     rows = collection_rows({"bc": results["bc"], "agpd": [run]})
     assert rows == [
-        ("agpd", "0.50", "0.50", "0.50", "0.200", "-", "-", "-", "-1.50", "0.50", "3"),
+        ("agpd", "0.50", "0.50", "0.50", "0.200", "-", "-", "-", "-", "-1.50", "0.50", "3"),
     ], "8 of 16 guided, 1 of 2 unguided; nothing of a method without rounds"
     assert len(rows[0]) == len(HEADER)
 

@@ -52,8 +52,10 @@ def action_diagnostics(
         seed: of the noise.
 
     Returns:
-        Root-mean-square distances in the teacher's units, and the KL divergence of the executed actions from the
-        teacher's in nats, mean and median over observations and executed steps.
+        Root-mean-square distances in the teacher's units; `teacher_spread`, the standard deviation of the teacher's
+        own samples (sigma_E of docs/theory.md: guidance cannot move a teacher that is certain); the KL
+        divergence of the executed actions from the teacher's in nats, mean and median over observations and
+        executed steps.
     """
     generator = torch.Generator(device=decider.generator.device).manual_seed(seed)
     repeated, units = decider.reseeded(generator), decider.pair.alignment.teacher_units
@@ -72,6 +74,7 @@ def action_diagnostics(
         "rms_to_student": _rms(of_strategy - student),
         "rms_to_teacher": _rms(of_strategy - of_teacher),
         "rms_teacher_to_student": _rms(of_teacher - student),
+        "teacher_spread": float(of_teacher.var(dim=0).mean().sqrt()),
         "kl_to_teacher": float(divergence.mean()),
         "kl_to_teacher_median": float(np.median(divergence)),
     }

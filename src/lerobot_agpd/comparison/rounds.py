@@ -18,6 +18,7 @@ HEADER = (
     "rms to the teacher",
     "rms to the student",
     "rms teacher to student",
+    "spread of the teacher",
     "KL to the teacher",
     "state entropy",
     "state coverage",
@@ -27,7 +28,7 @@ HEADER = (
 NOTE = """\
 Collection, means over rounds and training seeds; success pools their episodes. The teacher alone is the unguided share of every
 round. Distances are between executed chunks, root mean square in the teacher's units, with teacher and strategy sampled
-from the same noise; the KL divergence is that of moment-matched Gaussians over single actions (Eq. 14), in nats, the median
+from the same noise; the spread is the standard deviation of the teacher's own samples at one observation (older rounds lack it); the KL divergence is that of moment-matched Gaussians over single actions (Eq. 14), in nats, the median
 over observations. Entropy (nearest neighbours, nats) and held-out coverage (P_S) are those of kept states, in standard
 deviations of the demonstrations.
 """
@@ -53,6 +54,7 @@ def _numbers(rounds: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         ("rms_to_teacher", "{:.3f}"),
         ("rms_to_student", "{:.3f}"),
         ("rms_teacher_to_student", "{:.3f}"),
+        ("teacher_spread", "{:.3f}"),
         ("kl_to_teacher_median", "{:.2f}"),
     ):
         yield _mean([entry.get(key) for entry in actions], digits)
