@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -27,24 +29,26 @@ def draw_curves(methods: Mapping[str, Sequence[RunResult]], measure: str, title:
 
     A policy that was only evaluated is a dashed line at the mean of its final evaluation.
     """
-    figure = Figure(figsize=(6.4, 4.2), layout="constrained", dpi=150)
+    figure = Figure(figsize=(8, 4.2), layout="constrained", dpi=150)
     axes = figure.subplots()
-    for number, (name, runs) in enumerate(methods.items()):
-        if runs[0].curve:
-            _draw_method(axes, name, runs, measure, f"C{number}")
+    trained = [name for name, runs in methods.items() if runs[0].curve]
+    colours = matplotlib.colormaps["tab10" if len(trained) <= 10 else "tab20"]
+    for name, runs in methods.items():
+        if name in trained:
+            _draw_method(axes, name, runs, measure, colours(trained.index(name) % colours.N))
         else:
             level = float(np.mean(getattr(runs[0].finals["last"], MEASURES[measure])))
-            axes.axhline(level, color=f"C{number}", linestyle="--", label=name)
+            axes.axhline(level, color="black", linestyle="--", label=name)
     labels = {"success": "success rate", "max_reward": "mean max reward"}
     axes.set(title=title, xlabel="gradient steps", ylabel=labels[measure])
     if measure == "success":
         axes.set_ylim(-0.02, 1.02)
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
+    figure.legend(fontsize=8, loc="outside right upper")
     figure.savefig(path)
 
 
-def _draw_method(axes: Axes, name: str, runs: Sequence[RunResult], measure: str, colour: str) -> None:
+def _draw_method(axes: Axes, name: str, runs: Sequence[RunResult], measure: str, colour: Any) -> None:
     steps, values = mean_curve(runs, measure)
     if not len(steps):
         return
