@@ -4,7 +4,6 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-import yaml
 from matrices import content, evaluation, load
 from scipy.stats import t
 
@@ -25,7 +24,6 @@ def store(run, matrix, best, last, curve=None, rounds=(), seconds=None, adopted=
         run.folder / RESULT,
         {
             "flags": run.flags,
-            "config": None if run.policy else {"policy": {"guidance": {"scale": 0.5}}},
             "evaluation": asdict(matrix.evaluation),
             "measure": matrix.tasks[run.task].measure,
             "steps": None if run.policy else 20,
@@ -103,21 +101,6 @@ def test_a_row_of_the_table(compared):
     assert row[10:] == ("1.50 M", "2.0")
     teacher = method_row("teacher", results["teacher"])
     assert (teacher[1], teacher[2], teacher[8], teacher[9]) == ("-", "-", "-", "-")
-
-
-@pytest.mark.parametrize(
-    ("flag", "accepted"), [("scale: 0.5", True), ("scale: 0.25", False), ("at: mu", False)]
-)
-def test_spelling_out_what_was_the_default_is_no_difference(compared, flag, accepted):
-    _, results = compared
-    name, _, value = flag.partition(": ")
-    run = results["agpd"][0].run
-    asked = replace(run, flags={**run.flags, f"policy.guidance.{name}": yaml.safe_load(value)})
-    if accepted:
-        assert read_result(asked, compared[0]).steps == 20
-    else:
-        with pytest.raises(ValueError, match="made with other flags"):
-            read_result(asked, compared[0])
 
 
 def test_collection_rounds_are_pooled_and_averaged(compared):

@@ -66,8 +66,7 @@ def read_result(run: Run, matrix: Matrix) -> RunResult | None:
     }
     try:
         for key, wanted in asked.items():
-            made = _with_defaults(content, run.flags) if key == "flags" else content[key]
-            if made != json.loads(json.dumps(wanted)):
+            if content[key] != json.loads(json.dumps(wanted)):
                 raise ValueError(
                     f"{path} was made with other {key} than the matrix has now; run the comparison again"
                 )
@@ -90,18 +89,6 @@ def read_result(run: Run, matrix: Matrix) -> RunResult | None:
         raise ValueError(
             f"{path} is damaged ({error!r}); remove it and run the comparison again: finished parts are kept"
         ) from error
-
-
-def _with_defaults(content: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[str, Any]:
-    """The flags of a result, and what its configuration says of asked flags that were left to their defaults."""
-    flags = dict(content["flags"])
-    for name in asked.keys() - flags.keys():
-        value: Any = content["config"]
-        for part in name.split("."):
-            value = value.get(part) if isinstance(value, Mapping) else None
-        if value is not None:
-            flags[name] = value
-    return flags
 
 
 def _software(entry: Mapping[str, Any]) -> frozenset[str]:
