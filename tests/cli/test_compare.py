@@ -12,7 +12,7 @@ import pytest
 import yaml
 from rich.console import Console
 
-from lerobot_agpd.cli.compare import CompareConfig
+from lerobot_agpd.cli.compare import CompareConfig, load, needs_work
 from lerobot_agpd.comparison.jobs import Job, Step, activity, run_jobs
 
 ROOT = Path(__file__).parents[2]
@@ -179,6 +179,9 @@ def test_a_killed_comparison_goes_on_where_it_was(tmp_path):
     starts = [json.loads(line) for line in (agpd / "starts.jsonl").read_text().splitlines()]
     assert len(starts) == 2 and starts[0]["interrupted"] and "--resume=true" in starts[1]["command"]
     assert starts[1]["from_step"] in (SAVE, 2 * SAVE)
+    again = CompareConfig(matrix=matrix)
+    loaded, runs = load(again)
+    assert [needs_work(again, loaded, run) for run in runs] == [False, False], "nothing is trained again"
 
     result = json.loads((agpd / "run.json").read_text())
     assert list(result["curve"]) == ["10", "20", "30"]

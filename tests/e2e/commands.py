@@ -78,6 +78,8 @@ def run(command: str, *flags: object) -> str:
         log = Path(folder) / "log"
         process = start(command, *flags, log=log)
         process.join(timeout=900)
+        process.kill()  # nothing if it has ended; else pytest would wait for it at its own end
+        process.join()
         output = log.read_text()
     assert process.exitcode == 0, output[-5000:]
     return output
