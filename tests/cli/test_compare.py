@@ -15,6 +15,8 @@ from rich.console import Console
 from lerobot_agpd.cli.compare import CompareConfig, load, needs_work
 from lerobot_agpd.comparison.jobs import Job, Step, activity, run_jobs
 
+pytest.importorskip("lerobot_policy_agpd")  # registers the environment types
+
 ROOT = Path(__file__).parents[2]
 
 
