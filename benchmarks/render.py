@@ -16,8 +16,8 @@ import numpy as np
 from lerobot_agpd.analysis.frontier import NAMES
 from lerobot_agpd.analysis.report import MethodResult, markdown
 from lerobot_agpd.analysis.statistics import success_rate
-from lerobot_agpd.comparison.curves import draw_curves
 from lerobot_agpd.comparison.matrix import MEASURES, Matrix, load_matrix
+from lerobot_agpd.comparison.pictures import write_pictures
 from lerobot_agpd.comparison.results import RunResult, read_result
 from lerobot_agpd.comparison.runs import expand
 from lerobot_agpd.comparison.table import report
@@ -187,15 +187,11 @@ def committed(path: Path) -> tuple[Matrix, Results, list[str]] | None:
 
 
 def comparison_page(path: Path, matrix: Matrix, found: Results, missing: list[str], draw: bool) -> str:
-    """The page of one matrix; its learning curves are drawn beside the results."""
-    parts = [(COMPARISON / f"{path.stem}.md").read_text().rstrip(), report(matrix, found, missing).rstrip()]
-    for task, methods in found.items():
-        picture = matrix.output / f"curves-{task}.png"
-        if draw:
-            entry = matrix.tasks[task]
-            draw_curves(methods, entry.measure, entry.title or task, picture)
-        parts.append(f"![learning curves](../../{picture.relative_to(ROOT)})")
-    return "\n\n".join(parts) + "\n"
+    """The page of one matrix; its pictures are drawn beside the results."""
+    if draw:
+        write_pictures(matrix, found, matrix.output)
+    text = (COMPARISON / f"{path.stem}.md").read_text().rstrip()
+    return f"{text}\n\n{report(matrix, found, missing, f'../../{matrix.output.relative_to(ROOT)}/')}"
 
 
 def summary(comparisons: dict[Path, tuple[Matrix, Results, list[str]]]) -> str:

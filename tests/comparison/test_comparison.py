@@ -81,6 +81,8 @@ def test_a_part_of_the_matrix(tmp_path):
         ("seeds", ["a"], "list of integers"),
         ("seeds", [100_000], r"training seeds lie in \[0, 100000\)"),
         ("output", None, "output is missing"),
+        ("references", ["dc"], r"references \['dc'\] are no methods"),
+        ("references", "bc", "references must be a list of methods"),
         ("output", "${NOT_SET_ANYWHERE}/x", "NOT_SET_ANYWHERE"),
         ("evaluation.seed", 5, "leave the seeds that training and collection never use"),
         ("evaluation.curve_seed", 100_003, "overlap"),

@@ -2,19 +2,31 @@
 
 from dataclasses import asdict, replace
 
+import matplotlib.image
 import numpy as np
 import pytest
 from matrices import content, evaluation, load
 from scipy.stats import t
 
 from lerobot_agpd.analysis.latency import Latency
+from lerobot_agpd.analysis.statistics import success_rate
 from lerobot_agpd.comparison.curves import draw_curves, mean_curve
 from lerobot_agpd.comparison.evaluations import RESULT
 from lerobot_agpd.comparison.files import write_json
+from lerobot_agpd.comparison.outcomes import pooled
+from lerobot_agpd.comparison.pictures import write_pictures
 from lerobot_agpd.comparison.results import compare, read_result
 from lerobot_agpd.comparison.rounds import HEADER, collection_rows
 from lerobot_agpd.comparison.runs import expand
-from lerobot_agpd.comparison.table import difference_rows, method_row, report, training_time
+from lerobot_agpd.comparison.table import (
+    COST_HEADER,
+    RESULT_HEADER,
+    cost_row,
+    difference_rows,
+    report,
+    result_row,
+    training_time,
+)
 
 pytest.importorskip("lerobot_policy_agpd")  # registers the policy and environment types
 
@@ -90,17 +102,25 @@ def test_differences_are_paired_by_seed_and_environment(compared):
     assert compare(results["bc"][:1], results["agpd"][1:], "best", "success") is None
 
 
-def test_a_row_of_the_table(compared):
+def test_what_a_method_reached(compared):
     _, results = compared
-    row = method_row("agpd", results["agpd"])
-    assert row[:2] == ("agpd", "20")
-    assert row[2].startswith("0.88 [") and row[3].startswith("0.62 [") and row[4] == "0.50 / 0.75"
+    row = result_row("agpd", results["agpd"], "success")
+    assert len(row) == len(RESULT_HEADER) and row[:2] == ("agpd", "20")
+    assert row[2].startswith("0.62 [") and row[3].startswith("0.88 [") and row[4] == "0.50 / 0.75"
     assert row[7] == "8", "two training seeds of four environments"
-    assert row[8] == "15 / 12 / 10", "means per training seed"
-    assert row[9] == training_time(results["agpd"]) == "60 s: environment 10, teacher 20, training 30"
-    assert row[10:] == ("1.50 M", "2.0")
-    teacher = method_row("teacher", results["teacher"])
-    assert (teacher[1], teacher[2], teacher[8], teacher[9]) == ("-", "-", "-", "-")
+    assert result_row("agpd", results["agpd"], "max_reward")[4] == "0.25 / 0.38", "the task's own measure"
+    teacher = result_row("teacher", results["teacher"], "success")
+    assert (teacher[1], teacher[3], teacher[4], teacher[6]) == ("-",) * 4, "it has one checkpoint"
+
+
+def test_what_a_method_cost(compared):
+    _, results = compared
+    row = cost_row("agpd", results["agpd"])
+    assert len(row) == len(COST_HEADER) and row[0] == "agpd"
+    assert row[1] == "15 / 12 / 10", "means per training seed"
+    assert row[2] == training_time(results["agpd"]) == "60 s: environment 10, teacher 20, training 30"
+    assert row[3:] == ("1.50 M", "2.0")
+    assert cost_row("teacher", results["teacher"])[1:3] == ("-", "-")
 
 
 def test_collection_rounds_are_pooled_and_averaged(compared):
@@ -139,8 +159,31 @@ def test_the_report_says_if_the_code_changed_on_the_way(compared):
 
 def test_differences_without_spread_are_not_shown_as_certain(compared):
     _, results = compared
-    rows = difference_rows({"a": results["bc"], "b": results["bc"]}, "last", "success")
+    rows = difference_rows({"a": results["bc"], "b": results["bc"]}, ["a", "b"], "last", "success")
     assert rows == [("a", "", "+0.00 (in every pair)"), ("b", "+0.00 (in every pair)", "")]
+
+
+def test_all_are_compared_with_the_references(compared, tmp_path):
+    matrix, results = compared
+    text = report(load(tmp_path, content(tmp_path) | {"references": ["bc"]}), {"pusht": results}, [])
+    tables = [line for line in text.splitlines() if line == "|  | bc |"]
+    assert len(tables) == 2, "last and best checkpoint"
+    assert "|  | bc | agpd | teacher |" in report(matrix, {"pusht": results}, []), "by default all"
+
+
+def test_pictures_show_every_task_and_method(compared, tmp_path):
+    matrix, results = compared
+    write_pictures(matrix, {"pusht": results}, tmp_path)
+    text = report(matrix, {"pusht": results}, [], "figures/")
+    for name in ("outcomes-pusht.png", "curves-pusht.png"):
+        assert matplotlib.image.imread(tmp_path / name).std() > 0 and f"](figures/{name})" in text
+
+
+def test_pooled_measures_treat_episodes_alike(compared):
+    _, results = compared
+    assert pooled(results["agpd"], "last", "success") == success_rate([True] * 5 + [False] * 3)
+    rewards = pooled(results["agpd"], "last", "max_reward")
+    assert rewards.mean == 0.3125 and rewards.n == 8
 
 
 def test_curves_are_means_over_training_seeds(compared, tmp_path):

@@ -13,11 +13,11 @@ from lerobot.utils.utils import init_logging
 from rich.console import Console
 from rich.markdown import Markdown
 
-from lerobot_agpd.comparison.curves import draw_curves
 from lerobot_agpd.comparison.evaluations import evaluate_run
 from lerobot_agpd.comparison.files import write_text
 from lerobot_agpd.comparison.jobs import Job, Step, run_jobs
 from lerobot_agpd.comparison.matrix import Matrix, load_matrix
+from lerobot_agpd.comparison.pictures import write_pictures
 from lerobot_agpd.comparison.results import RunResult, read_result
 from lerobot_agpd.comparison.runs import Run, check, expand
 from lerobot_agpd.comparison.table import report
@@ -144,7 +144,7 @@ def show_commands(config: CompareConfig, matrix: Matrix, runs: Sequence[Run], co
 
 
 def write_report(matrix: Matrix, runs: Sequence[Run]) -> str:
-    """Write report.md and one picture of learning curves per task; returns the report.
+    """Write report.md and the pictures of every task; returns the report.
 
     Raises:
         ValueError: if no run has a result, or one is damaged.
@@ -164,9 +164,7 @@ def write_report(matrix: Matrix, runs: Sequence[Run]) -> str:
     }
     text = report(matrix, found, missing)
     write_text(matrix.output / REPORT, text)
-    for task, methods in found.items():
-        entry = matrix.tasks[task]
-        draw_curves(methods, entry.measure, entry.title or task, matrix.output / f"curves-{task}.png")
+    write_pictures(matrix, found, matrix.output)
     return text
 
 
@@ -189,7 +187,7 @@ def run(config: CompareConfig) -> None:
         failures = run_jobs(jobs, config.jobs, config.threads, console)
     if config.only != "train" and len(failures) < len(runs):
         console.print(Markdown(write_report(matrix, runs)))
-        logger.info("wrote %s and curves-*.png to %s", REPORT, matrix.output)
+        logger.info("wrote %s, outcomes-*.png and curves-*.png to %s", REPORT, matrix.output)
     if failures:
         logger.error("%d runs failed: %s; run the same command to go on", len(failures), ", ".join(failures))
         sys.exit(1)

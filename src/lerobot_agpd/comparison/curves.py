@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lerobot_agpd.comparison.matrix import MEASURES
+from lerobot_agpd.comparison.matrix import LABELS, MEASURES
 from lerobot_agpd.comparison.results import RunResult
 
 
@@ -39,8 +39,7 @@ def draw_curves(methods: Mapping[str, Sequence[RunResult]], measure: str, title:
         else:
             level = float(np.mean(getattr(runs[0].finals["last"], MEASURES[measure])))
             axes.axhline(level, color="black", linestyle="--", label=name)
-    labels = {"success": "success rate", "max_reward": "mean max reward"}
-    axes.set(title=title, xlabel="gradient steps", ylabel=labels[measure])
+    axes.set(title=title, xlabel="gradient steps", ylabel=LABELS[measure])
     if measure == "success":
         axes.set_ylim(-0.02, 1.02)
     axes.grid(alpha=0.3)

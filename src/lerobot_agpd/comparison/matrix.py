@@ -20,6 +20,9 @@ from lerobot_agpd.guidance.config import require
 MEASURES = {"success": "successes", "max_reward": "max_rewards"}
 """What a checkpoint is judged by, and the field of an evaluation that holds it."""
 
+LABELS = {"success": "success rate", "max_reward": "mean max reward"}
+"""What tables and pictures call it."""
+
 OWN_FLAGS = ("seed", "output_dir", "resume", "policy.teacher.path", "policy.replay.root", "env.type")
 """Flags that follow from a run's place in the matrix."""
 
@@ -97,8 +100,8 @@ class Matrix:
     """A comparison.
 
     Raises:
-        ValueError: for names that cannot be folders, no or repeated seeds, flags that the matrix sets itself, or a
-            method that takes a teacher where a task has none.
+        ValueError: for names that cannot be folders, no or repeated seeds, unknown references, flags that the
+            matrix sets itself, or a method that takes a teacher where a task has none.
     """
 
     tasks: dict[str, TaskEntry]
@@ -107,6 +110,7 @@ class Matrix:
     output: Path
     common: dict[str, Any] = field(default_factory=dict)
     evaluation: EvaluationEntry = field(default_factory=EvaluationEntry)
+    references: list[str] = field(default_factory=list)  # methods that all are compared with; default: all
 
     def __post_init__(self) -> None:
         for kind, names in (("task", self.tasks), ("method", self.methods)):
@@ -122,6 +126,8 @@ class Matrix:
             f"training seeds lie in [0, {EVALUATION_SEEDS[0]}): LeRobot's own evaluation counts up from them; got "
             f"{self.seeds}",
         )
+        unknown = [name for name in self.references if name not in self.methods]
+        require(not unknown, f"references {unknown} are no methods; there are {sorted(self.methods)}")
         self._check_flags()
         for task_name, task in self.tasks.items():
             for name, method in self.methods.items():
@@ -165,7 +171,10 @@ def load_matrix(path: Path) -> Matrix:
         )
         require(isinstance(common, dict), f"common must hold flags, got {common}")
         require(bool(content.get("output")), "output is missing: the folder of the comparison")
-        return Matrix(**entries, seeds=seeds, output=Path(content["output"]), common=common)
+        references = content.get("references") or []
+        require(isinstance(references, list), f"references must be a list of methods, got {references}")
+        output = Path(content["output"])
+        return Matrix(**entries, seeds=seeds, output=output, common=common, references=references)
     except (ValueError, yaml.YAMLError) as error:
         raise ValueError(f"--matrix={path}: {error}") from error
 
