@@ -16,11 +16,10 @@ import numpy as np
 from lerobot_agpd.analysis.frontier import NAMES
 from lerobot_agpd.analysis.report import MethodResult, markdown
 from lerobot_agpd.analysis.statistics import success_rate
-from lerobot_agpd.comparison.matrix import MEASURES, Matrix, load_matrix
+from lerobot_agpd.comparison.matrix import Matrix, load_matrix
 from lerobot_agpd.comparison.pictures import write_pictures
-from lerobot_agpd.comparison.results import RunResult, read_result
-from lerobot_agpd.comparison.runs import expand
-from lerobot_agpd.comparison.table import report
+from lerobot_agpd.comparison.results import RunResult, read_results
+from lerobot_agpd.comparison.table import difference_cell, raised, report
 
 ROOT = Path(__file__).parent.parent
 COMPARISON = ROOT / "benchmarks" / "comparison"
@@ -28,7 +27,6 @@ SUMMARY = {
     "bc": "cloning",
     "pd": "PD",
     "dagger": "DAgger",
-    "guided": "guided",
     "agpd": "AGPD",
     "teacher": "teacher",
 }
@@ -171,19 +169,7 @@ def committed(path: Path) -> tuple[Matrix, Results, list[str]] | None:
     os.environ["AGPD_RUNS"] = root.rpartition("/data/")[0]  # where the runs were made: part of their flags
     matrix = load_matrix(path)
     matrix.output = results_folder
-    found: Results = {}
-    missing = []
-    for run in expand(matrix):
-        result = read_result(run, matrix)
-        if result is not None:
-            found.setdefault(run.task, {}).setdefault(run.method, []).append(result)
-        elif run.folder.parent.exists():  # a method that was begun; the others are not part of the page
-            missing.append(run.name)
-    order = list(matrix.methods)
-    ordered = {
-        task: {name: methods[name] for name in order if name in methods} for task, methods in found.items()
-    }
-    return matrix, ordered, missing
+    return matrix, *read_results(matrix)
 
 
 def comparison_page(path: Path, matrix: Matrix, found: Results, missing: list[str], draw: bool) -> str:
@@ -196,25 +182,29 @@ def comparison_page(path: Path, matrix: Matrix, found: Results, missing: list[st
 
 def summary(comparisons: dict[Path, tuple[Matrix, Results, list[str]]]) -> str:
     """One row per task and one column per method: the task's measure at the last checkpoint."""
-    lines = [("", *SUMMARY.values()), tuple("---" for _ in range(len(SUMMARY) + 1))]
+    header = ("", *SUMMARY.values(), "AGPD minus PD")
+    lines = [header, tuple("---" for _ in header)]
     for path, (matrix, found, _) in comparisons.items():
         for task, methods in found.items():
             entry = matrix.tasks[task]
             cells = [summary_cell(methods.get(name, []), entry.measure) for name in SUMMARY]
             measure = "" if entry.measure == "success" else ", mean max reward"
             lines.append(
-                (f"[{entry.title or task}](docs/results/comparison-{path.stem}.md){measure}", *cells)
+                (
+                    f"[{entry.title or task}](docs/results/comparison-{path.stem}.md){measure}",
+                    *cells,
+                    difference_cell(methods.get("agpd", []), methods.get("pd", []), "last", entry.measure),
+                )
             )
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def summary_cell(runs: list[RunResult], measure: str) -> str:
-    """The mean over all training seeds, how many there are, and the spread of their means if there are several."""
+    """The mean over all training seeds; how many there are, as a raised number."""
     if not runs:
         return ""
-    means = [float(np.mean(getattr(run.finals["last"], MEASURES[measure]))) for run in runs]
-    spread = "" if len(means) == 1 else f" ({min(means):.2f} to {max(means):.2f}, {len(means)} seeds)"
-    return f"{np.mean(means):.2f}{spread}"
+    value = f"{np.mean([run.values('last', measure) for run in runs]):.2f}"
+    return value if runs[0].steps is None else value + raised(len(runs))
 
 
 def filled(text: str, name: str, table: str) -> str:

@@ -5,26 +5,27 @@ from dataclasses import asdict, replace
 import matplotlib.image
 import numpy as np
 import pytest
-from matrices import content, evaluation, load
+from matrices import changed, content, evaluation, load
 from scipy.stats import t
 
 from lerobot_agpd.analysis.latency import Latency
 from lerobot_agpd.analysis.statistics import success_rate
+from lerobot_agpd.cli.compare import CompareConfig, _readable, needs_work
 from lerobot_agpd.comparison.curves import draw_curves, mean_curve
-from lerobot_agpd.comparison.evaluations import RESULT
+from lerobot_agpd.comparison.evaluations import RESULT, digest
 from lerobot_agpd.comparison.files import write_json
 from lerobot_agpd.comparison.outcomes import pooled
 from lerobot_agpd.comparison.pictures import write_pictures
-from lerobot_agpd.comparison.results import compare, read_result
+from lerobot_agpd.comparison.results import compare, read_result, read_results
 from lerobot_agpd.comparison.rounds import HEADER, collection_rows
 from lerobot_agpd.comparison.runs import expand
 from lerobot_agpd.comparison.table import (
     COST_HEADER,
-    RESULT_HEADER,
     cost_row,
+    difference_cell,
     difference_rows,
     report,
-    result_row,
+    results_table,
     training_time,
 )
 
@@ -43,6 +44,7 @@ def store(run, matrix, best, last, curve=None, rounds=(), seconds=None, adopted=
             "best": {"step": 10, **asdict(evaluation(best))},
             "last": {"step": 20, **asdict(evaluation(last))},
             "latency": asdict(Latency(2.0, 3.0, 1_500_000, 1)),
+            "weights": digest(run.policy) if run.policy else None,
             "rounds": list(rounds),
             "seconds": seconds or {"total": 50.0},
             "starts": [{"rounds_adopted": adopted, "git": None, "versions": {"torch": "2"}}],
@@ -104,13 +106,37 @@ def test_differences_are_paired_by_seed_and_environment(compared):
 
 def test_what_a_method_reached(compared):
     _, results = compared
-    row = result_row("agpd", results["agpd"], "success")
-    assert len(row) == len(RESULT_HEADER) and row[:2] == ("agpd", "20")
-    assert row[2].startswith("0.62 [") and row[3].startswith("0.88 [") and row[4] == "0.50 / 0.75"
-    assert row[7] == "8", "two training seeds of four environments"
-    assert result_row("agpd", results["agpd"], "max_reward")[4] == "0.25 / 0.38", "the task's own measure"
-    teacher = result_row("teacher", results["teacher"], "success")
-    assert (teacher[1], teacher[3], teacher[4], teacher[6]) == ("-",) * 4, "it has one checkpoint"
+    header, rows = results_table(results, "success", 3)
+    row = dict(zip(header, rows[1], strict=True))
+    assert (row[""], row["training seeds"], row["gradient steps"]) == ("agpd", "2 of 3", "20")
+    assert row["success rate, last"].startswith("0.62 [") and row["by seed"] == "0.50 / 0.75"
+    assert row["success rate, best"].startswith("0.88 [")
+    teacher = dict(zip(header, rows[2], strict=True))
+    assert (teacher["training seeds"], teacher["by seed"], teacher["success rate, best"]) == ("-",) * 3
+
+
+def test_rewards_are_shown_where_they_add_something(compared, tmp_path):
+    _, results = compared
+    header, rows = results_table(results, "max_reward", 2)
+    assert header[3:] == (
+        "mean max reward, last",
+        "by seed",
+        "mean max reward, best",
+        "success rate, last",
+        "success rate, best",
+    ), "the task's own measure first"
+    assert rows[1][4] == "0.25 / 0.38", "of that measure"
+    assert "mean max reward, last" in results_table(results, "success", 2)[0], "half a success here"
+    told_by_success = [
+        replace(result, finals={name: same_reward(final) for name, final in result.finals.items()})
+        for result in results["bc"]
+    ]
+    assert "mean max reward, last" not in results_table({"bc": told_by_success}, "success", 2)[0]
+
+
+def same_reward(final):
+    """Fetch's: -1 until the goal is reached, then 0."""
+    return replace(final, max_rewards=[success - 1.0 for success in final.successes])
 
 
 def test_what_a_method_cost(compared):
@@ -119,8 +145,20 @@ def test_what_a_method_cost(compared):
     assert len(row) == len(COST_HEADER) and row[0] == "agpd"
     assert row[1] == "15 / 12 / 10", "means per training seed"
     assert row[2] == training_time(results["agpd"]) == "60 s: environment 10, teacher 20, training 30"
-    assert row[3:] == ("1.50 M", "2.0")
+    assert row[3:] == ("1.50 M",)
     assert cost_row("teacher", results["teacher"])[1:3] == ("-", "-")
+
+
+def test_one_training_seed_is_never_bold(compared):
+    _, results = compared
+    better = replace(results["agpd"][0], finals={"last": evaluation([1] * 39 + [0])})
+    worse = replace(results["bc"][0], finals={"last": evaluation([0] * 40)})
+    one = difference_cell([better], [worse], "last", "success")
+    assert one.startswith("+0.97 [") and one.endswith("]¹"), "it says nothing about other seeds"
+    others = [replace(result, run=replace(result.run, seed=2)) for result in (better, worse)]
+    two = difference_cell([better, others[0]], [worse, others[1]], "last", "success")
+    assert two.startswith("**+0.97 [") and two.endswith("]**²")
+    assert difference_cell([better], [], "last", "success") == "-"
 
 
 def test_collection_rounds_are_pooled_and_averaged(compared):
@@ -139,35 +177,69 @@ def test_collection_rounds_are_pooled_and_averaged(compared):
     assert len(rows[0]) == len(HEADER)
 
 
+@pytest.mark.parametrize(
+    ("where", "value"), [("env.obs_type", "pixels"), ("teacher", "other")], ids=["environment", "policy"]
+)
+def test_a_policy_is_evaluated_anew_if_it_or_its_environment_changed(compared, tmp_path, where, value):
+    matrix, _ = compared
+    (tmp_path / "other").mkdir()
+    value = str(tmp_path / value) if where == "teacher" else value
+    now = load(tmp_path, changed(content(tmp_path), f"tasks.pusht.{where}", value))
+    teacher = next(run for run in expand(now) if run.policy)
+    with pytest.raises(ValueError, match="made with other flags"):
+        read_result(teacher, now)
+    config = CompareConfig(matrix=tmp_path / "matrix.yaml")
+    assert needs_work(config, now, teacher)
+
+
+def test_a_policy_is_evaluated_anew_if_its_weights_changed(compared, tmp_path):
+    matrix, _ = compared
+    teacher = next(run for run in expand(matrix) if run.policy)
+    config = CompareConfig(matrix=tmp_path / "matrix.yaml")
+    assert not needs_work(config, matrix, teacher)
+    (tmp_path / "teacher" / "model.safetensors").write_bytes(b"trained again")
+    assert needs_work(config, matrix, teacher)
+
+
+def test_results_are_those_of_the_whole_matrix(compared):
+    matrix, _ = compared
+    first = expand(matrix)[0]
+    (first.folder / RESULT).write_text("{}")
+    with pytest.raises(ValueError, match="is damaged"):
+        read_results(matrix)
+    found, missing = read_results(matrix, _readable)
+    assert {name: len(runs) for name, runs in found["pusht"].items()} == {"bc": 1, "agpd": 2, "teacher": 1}
+    assert missing == [first.name], "a damaged one is named, not fatal"
+
+
 def test_the_report_says_what_is_missing_and_what_was_disturbed(compared):
     matrix, results = compared
-    text = report(matrix, {"pusht": results}, ["pusht/dagger/seed-1"])
-    assert "## pusht" in text and "Not finished: pusht/dagger/seed-1" in text
+    text = report(matrix, {"pusht": results}, ["pusht/dagger/seed-1", "pusht/dagger/seed-2"])
+    assert "## pusht" in text and "Not finished: pusht/dagger (seed-1, seed-2)" in text
     assert "`agpd`: the whole method" in text and "pusht/agpd/seed-2 (1)" in text
-    assert "same code" not in text
+    assert "same packages" not in text
     assert "| agpd | +0.50 [" in text and "4 other environments (seeds from 100000)" in text
 
 
-def test_the_report_says_if_the_code_changed_on_the_way(compared):
+def test_the_report_says_if_packages_changed_on_the_way(compared):
     matrix, results = compared
     run = results["bc"][0].run
     store(run, matrix, [1, 0, 0, 0], [0, 0, 0, 0], {10: [1, 1], 20: [1, 0]}, torch="3")
     results["bc"][0] = read_result(run, matrix)
     text = report(matrix, {"pusht": results}, [])
-    assert "Not all was made with the same code: torch 2; torch 3.**" in text
+    assert "Not all was made with the same packages: torch 2; torch 3.**" in text
 
 
 def test_differences_without_spread_are_not_shown_as_certain(compared):
     _, results = compared
     rows = difference_rows({"a": results["bc"], "b": results["bc"]}, ["a", "b"], "last", "success")
-    assert rows == [("a", "", "+0.00 (in every pair)"), ("b", "+0.00 (in every pair)", "")]
+    assert rows == [("a", "", "+0.00² (in every pair)"), ("b", "+0.00² (in every pair)", "")]
 
 
 def test_all_are_compared_with_the_references(compared, tmp_path):
     matrix, results = compared
     text = report(load(tmp_path, content(tmp_path) | {"references": ["bc"]}), {"pusht": results}, [])
-    tables = [line for line in text.splitlines() if line == "|  | bc |"]
-    assert len(tables) == 2, "last and best checkpoint"
+    assert "|  | bc |" in text.splitlines()
     assert "|  | bc | agpd | teacher |" in report(matrix, {"pusht": results}, []), "by default all"
 
 

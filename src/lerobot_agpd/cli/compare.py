@@ -13,12 +13,12 @@ from lerobot.utils.utils import init_logging
 from rich.console import Console
 from rich.markdown import Markdown
 
-from lerobot_agpd.comparison.evaluations import evaluate_run
+from lerobot_agpd.comparison.evaluations import digest, evaluate_run
 from lerobot_agpd.comparison.files import write_text
 from lerobot_agpd.comparison.jobs import Job, Step, run_jobs
 from lerobot_agpd.comparison.matrix import Matrix, load_matrix
 from lerobot_agpd.comparison.pictures import write_pictures
-from lerobot_agpd.comparison.results import RunResult, read_result
+from lerobot_agpd.comparison.results import RunResult, read_result, read_results
 from lerobot_agpd.comparison.runs import Run, check, expand
 from lerobot_agpd.comparison.table import report
 from lerobot_agpd.comparison.training import (
@@ -120,10 +120,14 @@ def needs_work(config: CompareConfig, matrix: Matrix, run: Run) -> bool:
         reached = progress(run)
         return not run.policy and not (reached is not None and reached.finished)
     try:
-        return read_result(run, matrix) is None
+        result = read_result(run, matrix)
     except ValueError as error:
         logger.warning("making the result again: %s", error)
         return True
+    if result is not None and run.policy and result.weights != digest(run.policy):
+        logger.warning("evaluating %s again: its weights have changed", run.policy)
+        return True
+    return result is None
 
 
 def show_commands(config: CompareConfig, matrix: Matrix, runs: Sequence[Run], console: Console) -> None:
@@ -134,38 +138,36 @@ def show_commands(config: CompareConfig, matrix: Matrix, runs: Sequence[Run], co
         state = "evaluated only" if run.policy else state
         state = state if needs_work(config, matrix, run) else "finished"
         lines = [f"# {run.name}: {state}"]
-        if not run.policy and not (reached and reached.finished):
+        if config.only != "evaluate" and not run.policy and not (reached and reached.finished):
             lines.append(shlex.join(train_command(run)))
-        lines.append(shlex.join(evaluate_command(config, matrix, run)))
+        if config.only != "train":
+            lines.append(shlex.join(evaluate_command(config, matrix, run)))
         console.print("\n".join(lines) + "\n", markup=False, highlight=False, soft_wrap=True)
 
 
 # ---- reporting ----
 
 
-def write_report(matrix: Matrix, runs: Sequence[Run]) -> str:
-    """Write report.md and the pictures of every task; returns the report.
+def write_report(matrix: Matrix) -> str:
+    """Write report.md and the pictures of all that the matrix has results of; returns the report.
 
     Raises:
-        ValueError: if no run has a result, or one is damaged.
+        ValueError: if there is no result.
     """
-    found: dict[str, dict[str, list[RunResult]]] = {}
-    missing = []
-    for run in runs:
-        result = read_result(run, matrix)
-        if result is None:
-            missing.append(run.name)
-        else:
-            found.setdefault(run.task, {}).setdefault(run.method, []).append(result)
+    found, missing = read_results(matrix, _readable)
     require(bool(found), f"{matrix.output} holds no result of this comparison yet")
-    order = list(matrix.methods)
-    found = {
-        task: {name: methods[name] for name in order if name in methods} for task, methods in found.items()
-    }
     text = report(matrix, found, missing)
     write_text(matrix.output / REPORT, text)
     write_pictures(matrix, found, matrix.output)
     return text
+
+
+def _readable(run: Run, matrix: Matrix) -> RunResult | None:
+    try:
+        return read_result(run, matrix)
+    except ValueError as error:
+        logger.warning("left out of the report: %s", error)
+        return None
 
 
 @draccus.wrap()
@@ -186,7 +188,7 @@ def run(config: CompareConfig) -> None:
         jobs = [job(config, matrix, entry) for entry in waiting]
         failures = run_jobs(jobs, config.jobs, config.threads, console)
     if config.only != "train" and len(failures) < len(runs):
-        console.print(Markdown(write_report(matrix, runs)))
+        console.print(Markdown(write_report(matrix)))
         logger.info("wrote %s, outcomes-*.png and curves-*.png to %s", REPORT, matrix.output)
     if failures:
         logger.error("%d runs failed: %s; run the same command to go on", len(failures), ", ".join(failures))

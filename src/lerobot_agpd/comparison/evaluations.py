@@ -56,7 +56,7 @@ class Evaluator:
     def _stored(self, name: str, path: str | Path, episodes: int, seed: int) -> Evaluation:
         file = self.folder / f"{name}.json"
         request = {
-            "weights": _digest(path),
+            "weights": digest(path),
             "env": draccus.encode(self.environments.config, EnvConfig),
             "episodes": episodes,
             "seed": seed,
@@ -91,7 +91,7 @@ def read_evaluation(file: Path, request: Mapping[str, Any]) -> Evaluation | None
     return evaluation if evaluation.seeds == wanted and lengths == {len(wanted)} else None
 
 
-def _digest(path: str | Path) -> str:
+def digest(path: str | Path) -> str:
     """SHA-256 of a checkpoint's weights; the name of a Hub repository."""
     weights = Path(path) / WEIGHTS
     if not weights.is_file():
@@ -158,6 +158,7 @@ def _evaluate_policy(run: Run, evaluator: Evaluator) -> dict[str, Any]:
     latency = Checkpoint(run.policy, evaluator.entry.device).latency()
     return {
         "policy": run.policy,
+        "weights": digest(run.policy),
         "command": None,
         "config": None,
         "steps": None,

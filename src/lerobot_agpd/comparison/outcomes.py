@@ -9,40 +9,49 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lerobot_agpd.analysis.statistics import Estimate, mean, success_rate
-from lerobot_agpd.comparison.matrix import LABELS, MEASURES
+from lerobot_agpd.comparison.matrix import LABELS
 from lerobot_agpd.comparison.results import RunResult
 
 
 def pooled(runs: Sequence[RunResult], which: str, measure: str) -> Estimate:
     """A measure over the episodes of all training seeds; its interval treats episodes as independent."""
-    values = [value for result in runs for value in getattr(result.finals[which], MEASURES[measure])]
+    values = [value for result in runs for value in result.values(which, measure)]
     return success_rate(values) if measure == "success" else mean(values)
 
 
 def draw_outcomes(methods: Mapping[str, Sequence[RunResult]], measure: str, title: str, path: Path) -> None:
-    """The last checkpoint's measure: mean and 95 % interval over all episodes, a small dot for every training seed.
+    """The last checkpoint's measure: a thick bar spans the training seeds, a thin one the interval of a single seed.
 
-    The interval of a policy that was only evaluated is a grey band, for the others to be compared with.
+    The thin bar covers environments only. A policy that was only evaluated is black, its interval a grey band.
     """
     figure = Figure(figsize=(8, 0.9 + 0.28 * len(methods)), layout="constrained", dpi=150)
     axes = figure.subplots()
-    for row, (name, runs) in enumerate(methods.items()):
-        _draw_row(axes, row, name, runs, measure)
+    for row, runs in enumerate(methods.values()):
+        _draw_row(axes, row, runs, measure)
     axes.set(title=title, xlabel=f"{LABELS[measure]}, last checkpoint")
-    axes.set_yticks(range(len(methods)), list(methods))
+    axes.set_yticks(range(len(methods)), [_label(name, runs) for name, runs in methods.items()])
     axes.invert_yaxis()
     axes.grid(alpha=0.3, axis="x")
     figure.savefig(path)
 
 
-def _draw_row(axes: Axes, row: int, name: str, runs: Sequence[RunResult], measure: str) -> None:
+def _label(name: str, runs: Sequence[RunResult]) -> str:
+    if runs[0].steps is None:
+        return name
+    return f"{name} ({len(runs)} seed{'s' * (len(runs) != 1)})"
+
+
+def _draw_row(axes: Axes, row: int, runs: Sequence[RunResult], measure: str) -> None:
     estimate = pooled(runs, "last", measure)
-    reference = runs[0].steps is None
-    if reference:
-        axes.axvspan(estimate.low, estimate.high, color="black", alpha=0.1, linewidth=0)
-    colour = "black" if reference else "tab:blue"
-    axes.plot([estimate.low, estimate.high], [row, row], color=colour, linewidth=2)
-    axes.plot(estimate.mean, row, "o", color=colour, markersize=7)
     if len(runs) > 1:
         seeds = [pooled([result], "last", measure).mean for result in runs]
-        axes.plot(seeds, [row] * len(seeds), "o", color="white", markeredgecolor=colour, markersize=4)
+        axes.plot([min(seeds), max(seeds)], [row, row], color="tab:blue", linewidth=5, alpha=0.4)
+        axes.plot(seeds, [row] * len(seeds), "o", color="white", markeredgecolor="tab:blue", markersize=4)
+        axes.plot(estimate.mean, row, "o", color="tab:blue", markersize=7)
+        return
+    evaluated = runs[0].steps is None
+    if evaluated:
+        axes.axvspan(estimate.low, estimate.high, color="black", alpha=0.1, linewidth=0)
+    colour = "black" if evaluated else "tab:blue"
+    axes.plot([estimate.low, estimate.high], [row, row], color=colour, linewidth=1)
+    axes.plot(estimate.mean, row, "o", color=colour, markerfacecolor="white", markersize=7)

@@ -14,8 +14,10 @@ from lerobot_agpd.comparison.results import RunResult
 def write_pictures(
     matrix: Matrix, results: Mapping[str, Mapping[str, Sequence[RunResult]]], folder: Path
 ) -> None:
-    """Write `outcomes-<task>.png` and `curves-<task>.png` of every task."""
+    """Write `outcomes-<task>.png` of all methods and `curves-<task>.png` of the references, for every task."""
     for task, methods in results.items():
         entry = matrix.tasks[task]
-        for name, draw in (("outcomes", draw_outcomes), ("curves", draw_curves)):
-            draw(methods, entry.measure, entry.title or task, folder / f"{name}-{task}.png")
+        title = entry.title or task
+        draw_outcomes(methods, entry.measure, title, folder / f"outcomes-{task}.png")
+        shown = {name: runs for name, runs in methods.items() if name in (matrix.references or methods)}
+        draw_curves(shown, entry.measure, title, folder / f"curves-{task}.png")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from lerobot_agpd.analysis.statistics import Difference, paired_difference
 from lerobot_agpd.comparison.evaluations import RESULT
 from lerobot_agpd.comparison.files import read_json
 from lerobot_agpd.comparison.matrix import MEASURES, Matrix
-from lerobot_agpd.comparison.runs import Run
+from lerobot_agpd.comparison.runs import Run, expand
 
 CHECKPOINTS = ("best", "last")
 
@@ -34,7 +34,9 @@ class RunResult:
         rounds: reports of the collection rounds.
         seconds: wall-clock by activity, and in total.
         rounds_adopted: rounds that an interrupted run's student met earlier than an uninterrupted one's.
-        made_with: code and packages of its training and evaluation, one set of texts for each.
+        commits: of this project's code, in training and evaluation.
+        packages: versions of the others, one set of texts for each start.
+        weights: digest of the weights of a policy that was only evaluated.
     """
 
     run: Run
@@ -46,7 +48,13 @@ class RunResult:
     rounds: Sequence[Mapping[str, Any]]
     seconds: Mapping[str, float]
     rounds_adopted: int
-    made_with: frozenset[frozenset[str]]
+    commits: frozenset[str]
+    packages: frozenset[frozenset[str]]
+    weights: str | None = None
+
+    def values(self, which: str, measure: str) -> list[Any]:
+        """A measure in every environment of the `best` or `last` checkpoint's final evaluation."""
+        return list(getattr(self.finals[which], MEASURES[measure]))
 
 
 def read_result(run: Run, matrix: Matrix) -> RunResult | None:
@@ -71,6 +79,7 @@ def read_result(run: Run, matrix: Matrix) -> RunResult | None:
                     f"{path} was made with other {key} than the matrix has now; run the comparison again"
                 )
         finals = {which: dict(content[which]) for which in CHECKPOINTS}
+        software = (*content["starts"], content["evaluated_with"])
         return RunResult(
             run=run,
             steps=content["steps"],
@@ -81,9 +90,9 @@ def read_result(run: Run, matrix: Matrix) -> RunResult | None:
             rounds=content["rounds"],
             seconds=content["seconds"],
             rounds_adopted=sum(start["rounds_adopted"] for start in content["starts"]),
-            made_with=frozenset(
-                _software(entry) for entry in (*content["starts"], content["evaluated_with"])
-            ),
+            commits=frozenset(_commit(entry["git"]) for entry in software),
+            packages=frozenset(_packages(entry["versions"]) for entry in software),
+            weights=content.get("weights"),
         )
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(
@@ -91,18 +100,41 @@ def read_result(run: Run, matrix: Matrix) -> RunResult | None:
         ) from error
 
 
-def _software(entry: Mapping[str, Any]) -> frozenset[str]:
-    git = entry["git"]
-    commit = f"{git['commit'][:9]}{' (modified)' if git['modified'] else ''}" if git else "no checkout"
-    return frozenset({commit, *(f"{name} {number}" for name, number in entry["versions"].items())})
+def _commit(git: Mapping[str, Any] | None) -> str:
+    return f"{git['commit'][:9]}{' (modified)' if git['modified'] else ''}" if git else "no checkout"
+
+
+def _packages(versions: Mapping[str, str]) -> frozenset[str]:
+    return frozenset(f"{name} {number}" for name, number in versions.items())
+
+
+def read_results(
+    matrix: Matrix, read: Callable[[Run, Matrix], RunResult | None] = read_result
+) -> tuple[dict[str, dict[str, list[RunResult]]], list[str]]:
+    """Results of a matrix by task and method, in its order, and the names of runs that have none.
+
+    Methods that were never begun on a task are not named: they are no part of the report.
+
+    Raises:
+        ValueError: as `read` does.
+    """
+    found: dict[str, dict[str, list[RunResult]]] = {}
+    missing = []
+    for run in expand(matrix):
+        result = read(run, matrix)
+        if result is not None:
+            found.setdefault(run.task, {}).setdefault(run.method, []).append(result)
+        elif run.folder.parent.exists():
+            missing.append(run.name)
+    order = list(matrix.methods)
+    return {
+        task: {name: methods[name] for name in order if name in methods} for task, methods in found.items()
+    }, missing
 
 
 def outcomes(results: Sequence[RunResult], which: str, measure: str) -> dict[int | None, list[float]]:
     """Training seed to the outcome in every environment of the final evaluation."""
-    return {
-        result.run.seed: [float(value) for value in getattr(result.finals[which], MEASURES[measure])]
-        for result in results
-    }
+    return {result.run.seed: [float(value) for value in result.values(which, measure)] for result in results}
 
 
 def compare(

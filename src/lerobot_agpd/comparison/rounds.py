@@ -13,7 +13,7 @@ from lerobot_agpd.comparison.results import RunResult
 HEADER = (
     "",
     "success of the strategy",
-    "of the teacher alone",
+    "of the unguided share",
     "shift in sigmas",
     "rms to the teacher",
     "rms to the student",
@@ -26,11 +26,13 @@ HEADER = (
 )
 
 NOTE = """\
-Collection, means over rounds and training seeds; success pools their episodes. The teacher alone is the unguided share of every
-round. Distances are between executed chunks, root mean square in the teacher's units, with teacher and strategy sampled
-from the same noise; the spread is the standard deviation of the teacher's own samples at one observation (older rounds lack it); the KL divergence is that of moment-matched Gaussians over single actions (Eq. 14), in nats, the median
-over observations. Entropy (nearest neighbours, nats) and held-out coverage (P_S) are those of kept states, in standard
-deviations of the demonstrations.
+Collection, means over rounds and training seeds; success pools their episodes. It is that of the filter, which wants success
+at the last step (or a reward) and leaves out starts that are solved already, so it is lower than in the evaluations. The
+unguided share of every round is the teacher's alone, with `rollin` after the student's part. Distances are between executed
+chunks, root mean square in the teacher's units, with teacher and strategy sampled from the same noise; the spread is the
+standard deviation of the teacher's own samples at one observation (older rounds lack it); the KL divergence is that of
+moment-matched Gaussians over single actions (Eq. 14), in nats, the median over observations. Entropy (nearest neighbours,
+nats) and held-out coverage (P_S) are those of kept states, in standard deviations of the demonstrations.
 """
 
 

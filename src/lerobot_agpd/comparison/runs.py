@@ -30,7 +30,7 @@ class Run:
         method: its name.
         seed: training seed; None for a policy that is only evaluated.
         folder: where everything of it lives.
-        flags: dotted flags of lerobot-train; empty if only evaluated.
+        flags: dotted flags of lerobot-train; of lerobot-eval if only evaluated.
         policy: checkpoint that is only evaluated; empty if trained.
     """
 
@@ -99,8 +99,10 @@ def _trained(matrix: Matrix, task_name: str, method_name: str, seed: int) -> Run
 
 def _evaluated(matrix: Matrix, task_name: str, method_name: str) -> Run:
     task, method = matrix.tasks[task_name], matrix.methods[method_name]
-    folder = matrix.output / task_name / method_name / "policy"
-    return Run(task_name, method_name, None, folder, {}, _policy(method, task))
+    folder, policy = matrix.output / task_name / method_name / "policy", _policy(method, task)
+    return Run(
+        task_name, method_name, None, folder, {"policy.path": policy, **flat({"env": task.env})}, policy
+    )
 
 
 def _policy(method: MethodEntry, task: TaskEntry) -> str:

@@ -18,40 +18,28 @@ from lerobot_agpd.comparison.rounds import (
 Methods = Mapping[str, Sequence[RunResult]]
 """Method to its results, one per training seed."""
 
-RESULT_HEADER = (
-    "",
-    "gradient steps",
-    "success, last",
-    "success, best",
-    "by seed, last",
-    "mean max reward, last",
-    "mean max reward, best",
-    "N",
-)
+COST_HEADER = ("", "episodes generated / successful / kept", "training time", "parameters")
 
-COST_HEADER = (
-    "",
-    "episodes generated / successful / kept",
-    "training time",
-    "parameters",
-    "ms per chunk",
-)
+RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 NOTES = """\
-Success counts at any step of an episode, as LeRobot evaluates. `last` is the checkpoint after the last gradient step,
-`best` the one with the highest {measure} over {curve_episodes} environments (seeds from {curve_seed}), as in the
-paper's appendix C; both are then evaluated on the same {episodes} other environments (seeds from {seed}), which
-neither training, collection nor the choice of the checkpoint used. N pools all training seeds; its intervals
-(Wilson, Student's t; 95 %) treat episodes as independent and therefore say nothing about another training seed.
+Success counts at any step of an episode, as LeRobot evaluates; starts that are solved already count too, for every
+method alike. `last` is the checkpoint after the last gradient step, `best` the one with the highest {measure} over
+{curve_episodes} environments (seeds from {curve_seed}), as in the paper's appendix C: few, so that it is often no better. Both
+are evaluated on the same {episodes} other environments (seeds from {seed}), which neither training, collection nor the
+choice of the checkpoint used. Intervals of single methods pool all training seeds (Wilson, Student's t; 95 %), treat
+episodes as independent and therefore say nothing about another training seed. A mean max reward that is
+success but for a constant is left out.
 
-Compare methods by the paired differences: row minus column, over the same training seeds and environments, with a 95 % t
-interval for training seeds and environments as crossed random factors (Satterthwaite's degrees of freedom). With three
-training seeds its factor is up to 4.3, so small differences are not told apart; with one, it does not cover training
-seeds at all. Bold: the interval excludes zero. Nothing is adjusted for the number of comparisons.
+Compare methods by the paired differences: row minus column, over the training seeds that both have (the raised number says
+how many) and the same environments, with a 95 % t interval for training seeds and environments as crossed random factors
+(Satterthwaite's degrees of freedom). Bold: two or more seeds, and the interval excludes zero. With one seed the
+interval covers environments only; two trainings of one and the same method differ by more. With three the factor is
+up to 4.3, so small differences are not told apart. Nothing is adjusted for the number of comparisons.
 
-Pictures: `outcomes` shows mean and interval over all episodes, and a small dot for every training seed; the grey band is
-the interval of a policy that was only evaluated. `curves` shows {curve_episodes} environments per checkpoint, the range
-over training seeds shaded, and a triangle at the highest point.
+Pictures: a thick bar spans a method's training seeds (small dots), a thin one is the interval over the episodes of a
+single seed. Learning curves show {curve_episodes} environments per checkpoint, the range over training seeds shaded, and a
+triangle at the highest point; a dashed line is a policy's final evaluation, on other environments.
 
 Episodes and times are means per training seed; times were taken on a machine that may have run other jobs beside.
 """
@@ -73,12 +61,12 @@ def _task(matrix: Matrix, task: str, methods: Methods, pictures: str) -> list[st
     measure = matrix.tasks[task].measure
     parts = [
         f"![outcomes]({pictures}outcomes-{task}.png)",
-        _markdown(RESULT_HEADER, [result_row(name, runs, measure) for name, runs in methods.items()]),
+        _markdown(*results_table(methods, measure, len(matrix.seeds))),
     ]
     references = [name for name in matrix.references or methods if name in methods]
-    for which in reversed(CHECKPOINTS) if len(methods) > 1 and references else ():
-        parts.append(f"Paired differences in {LABELS[measure]}, {which} checkpoint (row minus column):")
-        parts.append(_markdown(("", *references), difference_rows(methods, references, which, measure)))
+    if len(methods) > 1 and references:
+        parts.append(f"Paired differences in {LABELS[measure]}, last checkpoint (row minus column):")
+        parts.append(_markdown(("", *references), difference_rows(methods, references, "last", measure)))
     parts.append(f"![learning curves]({pictures}curves-{task}.png)")
     parts.append("### What it took")
     parts.append(_markdown(COST_HEADER, [cost_row(name, runs) for name, runs in methods.items()]))
@@ -120,33 +108,67 @@ def _remarks(results: Mapping[str, Methods], missing: Sequence[str]) -> list[str
             "- Interrupted runs whose student met collected rounds earlier than an uninterrupted one's (number of "
             f"rounds): {', '.join(early)}."
         )
-    software = set[frozenset[str]]().union(*(result.made_with for result in everything))
-    if len(software) > 1:
-        common = frozenset.intersection(*software)
-        kinds = sorted(", ".join(sorted(kind - common)) for kind in software)
-        remarks.append(f"- **Not all was made with the same code: {'; '.join(kinds)}.**")
+    commits = set[str]().union(*(result.commits for result in everything))
+    if len(commits) > 1:
+        remarks.append(
+            f"- The code went through {len(commits)} states meanwhile; each `run.json` names its own."
+        )
+    packages = set[frozenset[str]]().union(*(result.packages for result in everything))
+    if len(packages) > 1:
+        common = frozenset.intersection(*packages)
+        kinds = sorted(", ".join(sorted(kind - common)) for kind in packages)
+        remarks.append(f"- **Not all was made with the same packages: {'; '.join(kinds)}.**")
     if missing:
-        remarks.append(f"- **Not finished: {', '.join(missing)}.**")
+        remarks.append(f"- **Not finished: {_by_method(missing)}.**")
     return ["\n".join(remarks)] if remarks else []
 
 
-def result_row(name: str, runs: Sequence[RunResult], measure: str) -> tuple[str, ...]:
-    """What a method reached, in the order of RESULT_HEADER; seed by seed, the task's own measure."""
-    steps = {result.steps for result in runs} - {None}
-    success, reward = (
-        {which: pooled(runs, which, kind) for which in CHECKPOINTS} for kind in ("success", "max_reward")
-    )
-    by_seed = [f"{pooled([result], 'last', measure).mean:.2f}" for result in runs]
-    return (
-        name,
-        " / ".join(map(str, sorted(steps, key=str))) or "-",
-        str(success["last"]),
-        str(success["best"]) if steps else "-",
-        " / ".join(by_seed) if len(by_seed) > 1 else "-",
-        str(reward["last"]),
-        str(reward["best"]) if steps else "-",
-        str(success["last"].n),
-    )
+def _by_method(runs: Sequence[str]) -> str:
+    """`pusht/bc (seed-1, seed-2); pusht/agpd (seed-2)`."""
+    seeds: dict[str, list[str]] = {}
+    for name in runs:
+        method, _, seed = name.rpartition("/")
+        seeds.setdefault(method, []).append(seed)
+    return "; ".join(f"{method} ({', '.join(which)})" for method, which in seeds.items())
+
+
+def results_table(
+    methods: Methods, measure: str, n_seeds: int
+) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Header and rows of what the methods reached: the task's measure first, then the other if it adds anything.
+
+    Args:
+        methods: a task's results.
+        measure: what the task is judged by.
+        n_seeds: training seeds that the comparison is to have.
+    """
+    others = [kind for kind in LABELS if kind != measure and (kind == "success" or _reward_adds(methods))]
+    header = ["", "training seeds", "gradient steps", f"{LABELS[measure]}, last", "by seed"]
+    header += [f"{LABELS[measure]}, best"]
+    header += [f"{LABELS[kind]}, {which}" for kind in others for which in reversed(CHECKPOINTS)]
+    rows = []
+    for name, runs in methods.items():
+        trained = runs[0].steps is not None
+        by_seed = [f"{pooled([result], 'last', measure).mean:.2f}" for result in runs]
+        cells = [
+            name,
+            f"{len(runs)} of {n_seeds}" if trained else "-",
+            str(runs[0].steps) if trained else "-",
+            str(pooled(runs, "last", measure)),
+            " / ".join(by_seed) if len(runs) > 1 else "-",
+            str(pooled(runs, "best", measure)) if trained else "-",
+        ]
+        for kind in others:
+            cells += [str(pooled(runs, "last", kind)), str(pooled(runs, "best", kind)) if trained else "-"]
+        rows.append(tuple(cells))
+    return tuple(header), rows
+
+
+def _reward_adds(methods: Methods) -> bool:
+    """Whether the max rewards of the evaluations are more than success and a constant."""
+    finals = [result.finals[which] for runs in methods.values() for result in runs for which in CHECKPOINTS]
+    constants = [np.subtract(final.max_rewards, np.asarray(final.successes, float)) for final in finals]
+    return bool(np.ptp(np.concatenate(constants)) > 1e-6)
 
 
 def cost_row(name: str, runs: Sequence[RunResult]) -> tuple[str, ...]:
@@ -159,7 +181,6 @@ def cost_row(name: str, runs: Sequence[RunResult]) -> tuple[str, ...]:
         " / ".join(per_seed) if episodes["generated"] else "-",
         training_time(runs) if trained else "-",
         f"{runs[0].latency.n_parameters / 1e6:.2f} M",
-        f"{np.median([result.latency.median_ms for result in runs]):.1f}",
     )
 
 
@@ -184,19 +205,30 @@ def difference_rows(
     return [
         (
             name,
-            *("" if other == name else _cell(runs, methods[other], which, measure) for other in references),
+            *(
+                "" if other == name else difference_cell(runs, methods[other], which, measure)
+                for other in references
+            ),
         )
         for name, runs in methods.items()
     ]
 
 
-def _cell(runs: Sequence[RunResult], others: Sequence[RunResult], which: str, measure: str) -> str:
-    difference = compare(runs, others, which, measure)
+def difference_cell(runs: Sequence[RunResult], others: Sequence[RunResult], which: str, measure: str) -> str:
+    """E.g. `**+0.05 [+0.01, +0.09]**³`: bold if it excludes zero with several training seeds, their number raised."""
+    difference = compare(runs, others, which, measure) if runs and others else None
     if difference is None:
         return "-"
+    seeds = raised(difference.n_seeds)
     if difference.low == difference.high:  # no spread at all, which few environments may show by chance
-        return f"{difference.mean:+.2f} (in every pair)"
-    return f"**{difference}**" if difference.excludes_zero else str(difference)
+        return f"{difference.mean:+.2f}{seeds} (in every pair)"
+    bold = difference.excludes_zero and difference.n_seeds > 1
+    return f"**{difference}**{seeds}" if bold else f"{difference}{seeds}"
+
+
+def raised(number: int) -> str:
+    """A number of training seeds as table cells show it."""
+    return str(number).translate(RAISED)
 
 
 def _markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
