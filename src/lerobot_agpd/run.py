@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import draccus
 import torch
 import yaml
 from lerobot.configs import parser
-from lerobot.configs.train import TRAIN_CONFIG_NAME
+from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 from lerobot.envs import EnvConfig
 
 
@@ -27,7 +27,7 @@ class RunInfo:
     Attributes:
         output_dir: where the run writes, or None if nobody named a folder.
         env: the evaluation environment, or None.
-        steps: number of training steps, or None if unknown.
+        steps: number of training steps; None if a run that was declared did not say.
         resume: whether the run continues a checkpoint.
     """
 
@@ -57,14 +57,19 @@ def this_run() -> RunInfo:
         return declared
     config = _config_file(parser.parse_arg("config_path"))
     output_dir = parser.parse_arg("output_dir") or config.get("output_dir")
-    steps = parser.parse_arg("steps") or config.get("steps")
+    steps = parser.parse_arg("steps") or config.get("steps") or _default("steps")
     resume = parser.parse_arg("resume") or config.get("resume") or False
     return RunInfo(
         output_dir=Path(output_dir) if output_dir else None,
         env=_env(config.get("env")),
-        steps=int(steps) if steps else None,
+        steps=int(steps),
         resume=resume if isinstance(resume, bool) else draccus.decode(bool, yaml.safe_load(resume)),
     )
+
+
+def _default(name: str) -> Any:
+    """What lerobot-train takes where nobody says anything."""
+    return next(field.default for field in fields(TrainPipelineConfig) if field.name == name)
 
 
 def process_rank() -> int:

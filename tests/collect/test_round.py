@@ -197,6 +197,17 @@ def test_half_a_round_goes_on_with_the_same_tickets(tmp_path, demonstrations):
     assert {number: records[number].to_json() for number in first} == first
 
 
+def test_a_failed_upload_does_not_end_the_training(tmp_path, demonstrations, caplog):
+    """LeRobot writes the last checkpoint after the last update."""
+    rounds = Rounds(tmp_path, demonstrations, push_to_hub=True, repo_id="nobody/nothing")
+    _, records, seconds = rounds.collect()
+    rounds.runner.finish(0, rounds.runner.report(0, SCALE, records, seconds))
+    rounds.runner.merge()  # offline, or without a token
+    assert "could not be merged or uploaded" in caplog.text
+    assert f"lerobot-agpd-merge --root={tmp_path}" in caplog.text
+    assert len(rounds.store.rounds()) == 1
+
+
 def test_rollin_records_the_teachers_part(tmp_path, demonstrations):
     rounds = Rounds(tmp_path, demonstrations, strategy="rollin", rollin=RollinConfig(max_fraction=0.7))
     _, records, _ = rounds.collect()

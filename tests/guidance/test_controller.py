@@ -16,6 +16,9 @@ CONFIG = GuidanceConfig(scale=1.0, growth=2.0, tolerance=0.1, min_scale=0.25, ma
         (1.0, 0.0, 0.0, 2.0),  # a teacher that never succeeds cannot be hurt
         (3.0, 0.8, 0.8, 4.0),  # upper limit
         (0.3, 0.0, 0.8, 0.25),  # lower limit
+        (9.0, 0.8, 0.8, 9.0),  # a first scale beyond the limit never grows
+        (9.0, 0.0, 0.8, 4.5),  # and comes back
+        (0.1, 0.0, 0.8, 0.1),  # one below never shrinks to something larger
         (1.0, None, 0.8, 1.0),  # nothing was guided
         (1.0, 0.8, None, 1.0),  # nothing to compare with
     ],

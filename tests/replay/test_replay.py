@@ -191,7 +191,9 @@ def test_executed_future_and_its_mask(make_replay, deliver, collected, normalise
     replay.add_dataset(collected[0])
     replay.observe(deliver([0]))
     rows = torch.tensor([0, 3, 5, 13, 14])
-    now, later, is_pad = replay.executed_future(rows, ["observation.state"], 3)
+    now, executed, later, is_pad = replay.executed_future(rows, ["observation.state"], 3)
+    recorded = replay.table.columns["action"]
+    assert torch.equal(executed[0], recorded[0:3]) and torch.equal(executed[3], recorded[13:16])
     steps = [normaliser.unnormalise("observation.state", x)[:, 1].round().tolist() for x in (now, later)]
     assert steps == [[0, 3, 0, 0, 1], [3, 4, 0, 3, 3]]
     assert is_pad.tolist() == [False, True, True, False, True]

@@ -1,12 +1,14 @@
 """Collected episodes on disk: interrupted, continued, finished, merged."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_agpd.cli import merge
 from lerobot_agpd.replay.episode import Episode, EpisodeRecord, Ticket
 from lerobot_agpd.replay.store import ReplayStore
 from lerobot_agpd.replay.writer import EpisodeWriter
@@ -258,6 +260,23 @@ def test_merge_is_the_concatenation(store, write):
         for key in ("observation.state", "action", "next.reward", "agpd.round", "agpd.scale", "next.done"):
             assert torch.equal(ours[key], theirs[key])
         assert ours["agpd.strategy"] == theirs["agpd.strategy"] and ours["task"] == theirs["task"]
+
+
+def test_the_command_merges_again(store, write, monkeypatch):
+    write(store, 0, [episode(0), episode(1, length=2)])
+    monkeypatch.setattr(sys, "argv", ["lerobot-agpd-merge", f"--root={store.root}", "--repo_id=me/collected"])
+    merge.main()
+    assert len(LeRobotDataset("me/collected", root=store.root / "merged")) == 5
+
+
+def test_the_command_says_what_is_wrong(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["lerobot-agpd-merge", f"--root={tmp_path}"])
+    with pytest.raises(SystemExit, match="holds no kept episode"):
+        merge.main()
+    with pytest.raises(ValueError, match="--root=.*is not a folder"):
+        merge.MergeConfig(root=tmp_path / "nothing")
+    with pytest.raises(ValueError, match="needs --repo_id"):
+        merge.MergeConfig(root=tmp_path, push_to_hub=True)
 
 
 # ---- the writer ----

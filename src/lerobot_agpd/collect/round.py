@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -23,6 +24,8 @@ from lerobot_agpd.replay.episode import Episode, EpisodeRecord, Ticket
 from lerobot_agpd.replay.store import ReplayStore, Spool
 from lerobot_agpd.replay.writer import EpisodeWriter
 from lerobot_agpd.run import barrier
+
+logger = logging.getLogger(__name__)
 
 DIAGNOSTICS = 3
 """Stream of the random numbers of a round's diagnostics; the teacher's noise is stream 1."""
@@ -58,6 +61,33 @@ class RoundRunner:
         self.filter = SuccessFilter.from_config(self.config)
         self.writer = EpisodeWriter(demonstrations)
         self.seed, self.rank, self.n_ranks = seed, rank, n_ranks
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What makes a round this run's: every report of one says so."""
+        return {
+            "strategy": self.config.strategy,
+            "environment": {"type": self.env_config.type, "task": self.env_config.task},
+            "teacher": self.policy_config.teacher.path,
+            "seed": self.seed,
+        }
+
+    def check_own(self, report: Mapping[str, Any]) -> None:
+        """Refuse rounds that another run collected: they would silently be this one's.
+
+        Raises:
+            ValueError: naming what differs.
+        """
+        differing = [
+            f"{name} {report[name]!r} instead of {mine!r}"
+            for name, mine in self.identity.items()
+            if report.get(name, mine) != mine  # older reports have no seed
+        ]
+        if differing:
+            raise ValueError(
+                f"{self.store.root} holds rounds of another run ({'; '.join(differing)}); name another "
+                "--policy.replay.root, or resume that run (--resume=true)"
+            )
 
     def noise(self, number: int) -> torch.Generator:
         """Source of this process's sampling noise in a round."""
@@ -179,10 +209,8 @@ class RoundRunner:
         """The round's numbers."""
         return {
             "round": number,
-            "strategy": self.config.strategy,
+            **self.identity,
             "scale": scale,
-            "environment": {"type": self.env_config.type, "task": self.env_config.task},
-            "teacher": self.policy_config.teacher.path,
             "seconds": dict(seconds),
             "diagnostics": diagnostics,
             **summarise(records),
@@ -193,7 +221,18 @@ class RoundRunner:
         self.store.finish(number, self.n_ranks, report)
 
     def merge(self) -> None:
-        """Merge all rounds into one dataset and upload it if asked to; called on one process."""
-        merged = self.store.merge(self.config.repo_id or f"agpd/{self.store.root.resolve().parent.name}")
-        if merged is not None and self.config.push_to_hub:
-            merged.push_to_hub()
+        """Merge all rounds into one dataset and upload it if asked to; called on one process.
+
+        A failure is logged: LeRobot has yet to write the last checkpoint, and the rounds are complete as they are.
+        """
+        try:
+            merged = self.store.merge(self.config.repo_id)
+            if merged is not None and self.config.push_to_hub:
+                merged.push_to_hub()
+        except Exception:
+            logger.exception(
+                "the collected episodes could not be merged or uploaded; the rounds are complete in %s. Once the "
+                "cause is gone, run lerobot-agpd-merge --root=%s",
+                self.store.root,
+                self.store.root,
+            )

@@ -49,12 +49,18 @@ def make_decider(config: Any, pair: Pair, generator: torch.Generator) -> Decider
         ValueError: if the strategy guides and the teacher cannot be guided.
     """
     collect = config.collect
-    if collect.strategy == "guided" or (collect.strategy == "rollin" and config.guidance.scale > 0):
+    if needs_guidance(config):
         pair.teacher.require_guidance(config.guidance.at)
     decider = make_strategy(config, pair, generator)
     if collect.diagnostics.observations == 0:
         return decider
     return Witness(decider, collect.diagnostics.observations, seed=generator.initial_seed())
+
+
+def needs_guidance(config: Any) -> bool:
+    """Whether the teacher must be one that can be guided; roll-in with a scale of 0 leaves it alone."""
+    strategy = config.collect.strategy
+    return strategy == "guided" or (strategy == "rollin" and config.guidance.scale > 0)
 
 
 def make_strategy(config: Any, pair: Pair, generator: torch.Generator) -> PairDecider:

@@ -73,6 +73,11 @@ class DistilledConfig:
     adversary: AdversaryConfig = field(default_factory=AdversaryConfig)
     representation: RepresentationConfig = field(default_factory=RepresentationConfig)
 
+    @property
+    def predicted_steps(self) -> int:
+        """Steps from the current one on that `predict_action_chunk` returns."""
+        return sum(offset >= 0 for offset in self.chunk_offsets)  # type: ignore[attr-defined]
+
     def _save_pretrained(self, save_directory: Path) -> None:
         # The environment stays out of config.json: a checkpoint must load where its type is not registered.
         # The run's train_config.json has it.

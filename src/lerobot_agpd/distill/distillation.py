@@ -31,7 +31,13 @@ from lerobot_agpd.collect.seeds import noise_seed
 from lerobot_agpd.collect.strategies import round_strength
 from lerobot_agpd.distill.adversary import adversary_terms
 from lerobot_agpd.distill.guided import Proposer, present_step
-from lerobot_agpd.distill.parts import make_own_teacher, make_rounds, make_teacher, make_teacher_chunks
+from lerobot_agpd.distill.parts import (
+    check_steps,
+    make_own_teacher,
+    make_rounds,
+    make_teacher,
+    make_teacher_chunks,
+)
 from lerobot_agpd.distill.round_log import log_round, round_scalars
 from lerobot_agpd.distill.schedule import due_round
 from lerobot_agpd.distill.state import DistillationState
@@ -46,6 +52,8 @@ if TYPE_CHECKING:
     from lerobot_agpd.distill.student import DistilledStudent
 
 logger = logging.getLogger(__name__)
+
+ADVERSARY_LOG = ("discriminator_loss", "adversarial_loss", "discriminator_accuracy")
 
 PROPOSALS = 2
 """Stream of the noise that students draw from torch's own generator; the teacher's noise is stream 1."""
@@ -84,6 +92,8 @@ class Distillation:
         self.own_teacher = make_own_teacher(student, self.state)
         self.teacher = None if self.own_teacher else make_teacher(student, self.demonstrations)
         self.rounds = make_rounds(self.config, self.run, self.state, self.demonstrations, self.teacher, seed)
+        if self.rounds is not None:
+            check_steps(student, self.teacher, memory.table)
         self.teacher_chunks = make_teacher_chunks(self.config, self.teacher, self.replay, seed)
         self.reports: list[Mapping[str, Any]] = []
         self._adopt_finished_rounds()
@@ -93,6 +103,8 @@ class Distillation:
         if self.rounds is None:
             return
         finished = self.rounds.store.rounds()
+        if finished and self.state.checkpoint is None:
+            self.rounds.check_own(finished[0].report)
         if len(finished) < self.state.rounds:
             raise FileNotFoundError(
                 f"the checkpoint has used {self.state.rounds} collection rounds, {self.rounds.store.root} holds "
@@ -194,10 +206,12 @@ class Distillation:
         report["updates"] = self.state.updates
         report["next_scale"] = self.scale
         if self.config.collect.guides:
+            # A frozen teacher's rate is best known from all rounds; one that still learns has only its newest.
+            known = (report,) if self.own_teacher else (*self.reports, report)
             report["next_scale"] = next_scale(
                 self.scale,
                 success_rate([report["guided"]]),
-                success_rate([past["unguided"] for past in (*self.reports, report)]),
+                success_rate([past["unguided"] for past in known]),
                 self.config.guidance,
             )
         return report
@@ -218,8 +232,10 @@ class Distillation:
         if config.weight == 0 or updates < config.start or updates % config.every:
             return 0.0, {}
         rows, reference_chunk, compared = self._reference_chunks(rows)
-        if len(reference_chunk) == 0:
-            return 0.0, {}
+        if (
+            len(reference_chunk) == 0
+        ):  # LeRobot averages over processes by position: every one needs the same keys
+            return 0.0, dict.fromkeys(ADVERSARY_LOG, 0.0)
         assert self.student.discriminator is not None
         student_chunk, embedding = self.student.prior_chunk(rows)
         terms = adversary_terms(
@@ -229,11 +245,8 @@ class Distillation:
             embedding,
             config,
         )
-        return terms.discriminator + terms.student, {
-            "discriminator_loss": terms.discriminator.item(),
-            "adversarial_loss": terms.log_d.item(),
-            "discriminator_accuracy": terms.accuracy.item(),
-        }
+        measured = (terms.discriminator.item(), terms.log_d.item(), terms.accuracy.item())
+        return terms.discriminator + terms.student, dict(zip(ADVERSARY_LOG, measured, strict=True))
 
     def _reference_chunks(self, rows: Batch) -> tuple[Batch, Tensor, Tensor]:
         """What D compares the student with: the teacher's own chunks, or what a self-taught student executed.
@@ -255,11 +268,10 @@ class Distillation:
         representation = self.student.representation
         if representation is None:
             return 0.0, {}
-        n_steps = representation.n_steps
-        now, later, is_pad = self.replay.executed_future(rows[ROW], self.replay.vector_keys, n_steps)
-        present = present_step(self.config)
-        predicted = representation(now, rows[ACTION][:, present : present + n_steps])
-        loss = reconstruction_loss(predicted, later, is_pad)
+        now, executed, later, is_pad = self.replay.executed_future(
+            rows[ROW], self.replay.vector_keys, representation.n_steps
+        )
+        loss = reconstruction_loss(representation(now, executed), later, is_pad)
         return self.config.representation.weight * loss, {"representation_loss": loss.item()}
 
     # ---- alternation ----

@@ -115,17 +115,20 @@ def future_steps(config: Any) -> int:
     return sum(offset >= 0 for offset in config.chunk_offsets)
 
 
-def executed_steps(config: Any, teacher: Teacher) -> int:
-    """Steps n of a chunk that collection executes and compares.
+def executed_steps(config: Any, teacher: Teacher | None) -> int:
+    """Steps n of a chunk that collection executes and compares; without a teacher, the student's own.
 
     Raises:
         ValueError: if more are asked for than either policy predicts.
     """
-    n_steps = config.collect.n_action_steps or min(config.n_action_steps, teacher.n_action_steps)
-    limit = min(future_steps(config), teacher.n_chunk_steps)
-    if n_steps > limit:
+    own = config.n_action_steps
+    n_steps = config.collect.n_action_steps or (min(own, teacher.n_action_steps) if teacher else own)
+    predicted = {"the student": config.predicted_steps}
+    if teacher:
+        predicted["the teacher"] = teacher.n_chunk_steps
+    if n_steps > min(predicted.values()):
         raise ValueError(
-            f"--policy.collect.n_action_steps={n_steps} exceeds what both policies predict from the current step "
-            f"on: the student {future_steps(config)}, the teacher {teacher.n_chunk_steps}"
+            f"--policy.collect.n_action_steps={n_steps} exceeds what is predicted from the current step on: "
+            + ", ".join(f"{who} {number}" for who, number in predicted.items())
         )
     return n_steps

@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 from lerobot_agpd.collect.round import RoundRunner
+from lerobot_agpd.collect.strategies import needs_guidance
 from lerobot_agpd.distill.environment import check_environment_fits, run_environment
-from lerobot_agpd.distill.guided import future_steps
+from lerobot_agpd.distill.guided import executed_steps, future_steps
 from lerobot_agpd.distill.own_teacher import OwnTeacher
 from lerobot_agpd.distill.relabel import TeacherChunks
 from lerobot_agpd.distill.state import DistillationState, replay_root
+from lerobot_agpd.guidance.config import require
 from lerobot_agpd.guidance.loading import check_teacher_fits, load_teacher
 from lerobot_agpd.guidance.teacher import Teacher
+from lerobot_agpd.replay.memory import FrameTable
 from lerobot_agpd.replay.replay import Replay
 from lerobot_agpd.replay.store import ReplayStore
 from lerobot_agpd.run import RunInfo, process_rank, world_size
 
 if TYPE_CHECKING:
     from lerobot_agpd.distill.student import DistilledStudent
+
+logger = logging.getLogger(__name__)
 
 
 def make_own_teacher(student: DistilledStudent, state: DistillationState) -> OwnTeacher | None:
@@ -31,11 +37,19 @@ def make_own_teacher(student: DistilledStudent, state: DistillationState) -> Own
         state: its progress; a resumed run goes on with the checkpoint's previous self.
 
     Raises:
-        ValueError: if relabelling, or an adversary without collected episodes, needs another teacher.
+        ValueError: if relabelling, or an adversary without collected episodes, needs another teacher; for
+            settings of a teacher that there is not.
     """
     config = student.config
     if config.teacher.path or not student.can_teach_itself:
         return None
+    for name in ("num_inference_steps", "noise_scheduler"):
+        value = getattr(config.teacher, name)
+        require(
+            value is None,
+            f"--policy.teacher.{name}={value} has no meaning in self-distillation, where the student teaches as it "
+            "samples itself; leave it out, or give a teacher (--policy.teacher.path)",
+        )
     if config.replay.relabel != "none":
         raise ValueError(
             f"--policy.replay.relabel={config.replay.relabel} needs a teacher (--policy.teacher.path); in "
@@ -67,7 +81,7 @@ def make_teacher(student: DistilledStudent, demonstrations: LeRobotDatasetMetada
         teacher,
         student.demonstrated_features(demonstrations),
         config.action_feature,
-        config.guidance if config.collect.guides else None,
+        config.guidance if needs_guidance(config) else None,
     )
     return teacher
 
@@ -89,6 +103,21 @@ def make_rounds(
         return None
     env_config = run_environment(config.collect, run)
     check_environment_fits(env_config, config, teacher)
+    guided = config.guidance.adaptive and config.guidance.scale > 0 and needs_guidance(config)
+    if guided and int(config.collect.episodes * config.collect.unguided_fraction) == 0:
+        logger.warning(
+            "--policy.collect.unguided_fraction=%s of --policy.collect.episodes=%d is less than one episode: the "
+            "teacher's own success rate stays unknown and the guidance scale at %s",
+            config.collect.unguided_fraction,
+            config.collect.episodes,
+            config.guidance.scale,
+        )
+    if config.collect.keep_failures and config.replay.relabel != "all":
+        logger.warning(
+            "--policy.collect.keep_failures=true with --policy.replay.relabel=%s: the student imitates the failures "
+            "as they were recorded; --policy.replay.relabel=all gives it the teacher's chunks there",
+            config.replay.relabel,
+        )
     root = replay_root(config.replay, run, state)
     state.replay_root = str(root)
     return RoundRunner(
@@ -99,6 +128,39 @@ def make_rounds(
         seed=seed,
         rank=process_rank(),
         n_ranks=world_size(),
+    )
+
+
+def check_steps(student: DistilledStudent, teacher: Teacher | None, demonstrations: FrameTable) -> None:
+    """Refuse numbers of executed steps that a round, or the learned J, could not work with.
+
+    Args:
+        student: the policy in training.
+        teacher: None in self-distillation.
+        demonstrations: their frames.
+
+    Raises:
+        ValueError: naming the flag.
+    """
+    n_steps, representation = executed_steps(student.config, teacher), student.representation
+    if representation is None:
+        return
+    require(
+        n_steps == representation.n_steps,
+        f"--policy.representation.type=state predicts {representation.n_steps} steps ahead, and rounds execute "
+        f"{n_steps} (the teacher's own number); set --policy.collect.n_action_steps={n_steps}",
+    )
+    longest = int((demonstrations.episode_end - demonstrations.episode_start).max())
+    require(
+        longest > n_steps,
+        f"--policy.representation.type=state predicts {n_steps} steps ahead, and no demonstration is longer than "
+        f"{longest}; set --policy.collect.n_action_steps below that",
+    )
+    collect = student.config.collect
+    require(
+        not (collect.strategy == "mixing" and collect.mixing.relabel),
+        "--policy.collect.mixing.relabel=true records actions that were not executed, and "
+        "--policy.representation.type=state learns what recorded actions lead to; use --policy.replay.relabel=all",
     )
 
 

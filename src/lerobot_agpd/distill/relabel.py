@@ -77,7 +77,10 @@ class TeacherChunks:
             generator = torch.Generator(device=self._chunks.device).manual_seed(self.seed + start)
             for part in episode.split(BATCH_SIZE):
                 history = self.replay.history(part, keys, self.teacher.n_obs_steps)
-                raw = self.teacher.sample(history, generator=generator)[:, : self.n_shared]
+                with torch.autocast(
+                    self._chunks.device.type, enabled=False
+                ):  # as precise as what it executes
+                    raw = self.teacher.sample(history, generator=generator)[:, : self.n_shared]
                 normalised = self.replay.memory.normaliser.normalise(ACTION, raw.to(self._chunks.device))
                 self._chunks[part] = 0.0
                 self._chunks[part, : self.n_shared] = normalised

@@ -82,8 +82,9 @@ class DistilledStudent(nn.Module):
             )
         self.representation: StateRepresentation | None = None
         if config.representation.type == "state":
+            n_steps = config.collect.n_action_steps or config.n_action_steps  # Distillation checks it
             self.representation = StateRepresentation(
-                vector_dim(config), action_dim, config.n_action_steps, config.representation
+                vector_dim(config), action_dim, n_steps, config.representation
             )
         self._demonstrations = (dataset_meta, dataset_stats)
         self._distillation: Distillation | None = None

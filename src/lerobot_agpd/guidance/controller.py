@@ -17,11 +17,12 @@ def next_scale(
     Args:
         scale: scale of the finished round.
         guided_success: success rate of its guided episodes, None if there were none.
-        unguided_success: success rate of all unguided episodes so far, None if there were none.
-        config: limits and step size.
+        unguided_success: success rate of the teacher's unguided episodes, None if there were none.
+        config: limits and step size; a first scale beyond a limit only ever moves back toward it.
     """
     if not config.adaptive or guided_success is None or unguided_success is None or config.scale == 0:
         return scale
     good = guided_success >= unguided_success - config.tolerance
-    moved = scale * config.growth if good else scale / config.growth
-    return min(max(moved, config.min_scale), config.max_scale)
+    if good:
+        return max(scale, min(scale * config.growth, config.max_scale))
+    return min(scale, max(scale / config.growth, config.min_scale))

@@ -18,7 +18,6 @@ from typing import Any, ClassVar
 
 import torch
 from lerobot.configs import PolicyFeature
-from lerobot.lerobot_types import TransitionKey
 from lerobot.policies import PreTrainedPolicy
 from lerobot.processor import (
     NormalizerProcessorStep,
@@ -33,6 +32,7 @@ from torch import Tensor
 
 from lerobot_agpd.guidance.config import GUIDANCE_POINTS
 from lerobot_agpd.guidance.guide import Guide
+from lerobot_agpd.guidance.units import ActionUnits
 
 Features = Mapping[str, PolicyFeature]
 
@@ -75,7 +75,7 @@ class Teacher(ABC):
                 f"the preprocessor of the {self.type} teacher has no normaliser, so its action space is unknown; "
                 f"its steps are {[type(step).__name__ for step in preprocessor.steps]}"
             )
-        self._normaliser = normalisers[0]
+        self._units = ActionUnits(normalisers[0], self.action_feature.shape[0])
         if any(
             isinstance(step, RelativeActionsProcessorStep) and step.enabled for step in preprocessor.steps
         ):
@@ -140,8 +140,8 @@ class Teacher(ABC):
     # ---- action spaces ----
 
     def to_units(self, actions_raw: Tensor) -> Tensor:
-        """Raw actions (..., A) in the teacher's normalised space."""
-        return self._normaliser({TransitionKey.ACTION: actions_raw})[TransitionKey.ACTION]
+        """Raw actions (..., A) in the teacher's normalised space (`guidance/units.py`)."""
+        return self._units.of(actions_raw)
 
     def to_raw(self, actions: Tensor) -> Tensor:
         """Actions (..., A) of the teacher's normalised space in the environment's units."""

@@ -171,13 +171,14 @@ class Replay:
 
     def executed_future(
         self, rows: Tensor, keys: Sequence[str], n_steps: int
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """What the representation learns from, in the student's normalised space.
 
         Returns:
-            Observations now (B, D) and n_steps later (B, D), features side by side, and the mask (B,) that is
-            True where the later one lies beyond the episode.
+            Observations now (B, D), features side by side, the recorded actions (B, n, A) that led to the
+            observations n_steps later (B, D), and the mask (B,) that is True where those lie beyond the episode.
         """
+        actions, _ = self.table.gather(ACTION, rows, torch.arange(n_steps))
         now, later = [], []
         is_pad = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
         for key in keys:
@@ -185,7 +186,7 @@ class Replay:
             now.append(values[:, 0])
             later.append(values[:, 1])
             is_pad = pad[:, 1]
-        return torch.cat(now, dim=1), torch.cat(later, dim=1), is_pad
+        return torch.cat(now, dim=1), actions, torch.cat(later, dim=1), is_pad
 
     @property
     def vector_keys(self) -> list[str]:

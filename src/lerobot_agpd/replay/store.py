@@ -186,8 +186,9 @@ class ReplayStore:
 
     # ---- merging ----
 
-    def merge(self, repo_id: str) -> LeRobotDataset | None:
-        """All rounds as one dataset in `<root>/merged`; None if nothing was kept."""
+    def merge(self, repo_id: str | None = None) -> LeRobotDataset | None:
+        """All rounds as one dataset in `<root>/merged`, named after the run by default; None if nothing was kept."""
+        repo_id = repo_id or f"agpd/{self.root.resolve().parent.name}"
         roots = [path for round_ in self.rounds() for path in round_.datasets]
         if not roots:
             return None

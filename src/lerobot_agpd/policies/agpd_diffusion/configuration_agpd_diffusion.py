@@ -34,6 +34,11 @@ class AGPDDiffusionConfig(DistilledConfig, DiffusionTransformerConfig):
         return None
 
     @property
+    def predicted_steps(self) -> int:
+        """Of its chunk, LeRobot's diffusion policy returns the steps that it would execute."""
+        return self.n_action_steps
+
+    @property
     def observation_history(self) -> int:
         """Steps of an observation."""
         return self.n_obs_steps

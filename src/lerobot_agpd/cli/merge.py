@@ -1,0 +1,52 @@
+"""`lerobot-agpd-merge`: the episodes that a run has collected as one LeRobotDataset, and to the Hub."""
+
+import logging
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import draccus
+from lerobot.utils.utils import init_logging
+
+from lerobot_agpd.guidance.config import require
+from lerobot_agpd.replay.store import ReplayStore
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass
+class MergeConfig:
+    """Options of `lerobot-agpd-merge`; a run that reaches its last step merges by itself."""
+
+    root: Path  # folder of a run's collected episodes, <output_dir>/agpd
+    repo_id: str | None = None  # name of the merged dataset, and its Hub repository; default: after the run
+    push_to_hub: bool = False  # upload it
+
+    def __post_init__(self) -> None:
+        require(self.root.is_dir(), f"--root={self.root} is not a folder")
+        require(not self.push_to_hub or bool(self.repo_id), "--push_to_hub=true needs --repo_id")
+
+
+@draccus.wrap()
+def run(config: MergeConfig) -> None:
+    """Merge all finished rounds, and upload."""
+    merged = ReplayStore(config.root).merge(config.repo_id)
+    require(merged is not None, f"--root={config.root} holds no kept episode")
+    assert merged is not None
+    logger.info("%d episodes, %d frames in %s", merged.num_episodes, merged.num_frames, merged.root)
+    if config.push_to_hub:
+        merged.push_to_hub()
+        logger.info("uploaded to %s", config.repo_id)
+
+
+def main() -> None:
+    """Console entry point."""
+    init_logging()
+    try:
+        run()
+    except ValueError as error:
+        sys.exit(f"lerobot-agpd-merge: {error}")
+
+
+if __name__ == "__main__":
+    main()
