@@ -5,6 +5,7 @@
 source "$(dirname "$0")/common.sh"
 output=${1:-outputs/transfer_cube}
 env=(--env.type=aloha_state --env.task=AlohaTransferCube-v0)
+settings "$output"
 horizon=(--policy.horizon=32 --policy.n_action_steps=16)      # 0.3 s of executed motion
 chunk=(--policy.chunk_size=32 --policy.n_action_steps=16)
 

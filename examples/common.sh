@@ -13,6 +13,17 @@ STUDENT_STEPS=${STUDENT_STEPS:-4000}       # gradient steps of the students
 ROUND_EPISODES=${ROUND_EPISODES:-50}       # episodes of each of five collection rounds
 EVALUATION_EPISODES=${EVALUATION_EPISODES:-200}
 
+# settings OUTPUT: refuse a folder that was made with other sizes, whose finished steps would be taken for these
+settings() {
+    local now="FEW=$FEW MANY=$MANY SKILL=$SKILL TEACHER_STEPS=$TEACHER_STEPS STUDENT_STEPS=$STUDENT_STEPS ROUND_EPISODES=$ROUND_EPISODES"
+    mkdir -p "$1"
+    if [ -e "$1/settings" ] && [ "$(cat "$1/settings")" != "$now" ]; then
+        echo "$1 was made with $(cat "$1/settings"), not with $now; name another output folder" >&2
+        exit 1
+    fi
+    echo "$now" > "$1/settings"
+}
+
 # record FOLDER EPISODES SEED FLAGS...
 record() {
     [ -d "$1" ] && return

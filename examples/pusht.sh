@@ -8,6 +8,7 @@ source "$(dirname "$0")/common.sh"
 source_data=${1:?usage: examples/pusht.sh SOURCE [output folder]}
 output=${2:-outputs/pusht}
 env=(--env.type=pusht --env.obs_type=environment_state_agent_pos)
+settings "$output"
 
 [ -d "$output/many" ] || lerobot-agpd-import-pusht --source="$source_data" --root="$output/many"
 [ -d "$output/few" ] || lerobot-agpd-import-pusht --source="$source_data" --root="$output/few" --first_episodes="$FEW"

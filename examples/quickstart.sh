@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# The main job in a few minutes on two CPU cores, offline: clone ten demonstrations of FetchPickAndPlace, distil a
+# The main job in a quarter of an hour (half an hour if they are busy) on two CPU cores, offline: clone ten demonstrations of FetchPickAndPlace, distil a
 # diffusion teacher into the same student, compare. How the teacher and the demonstrations were made is at the end.
 # usage: examples/quickstart.sh [output folder, default outputs/quickstart]
 set -euo pipefail

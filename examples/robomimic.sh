@@ -8,6 +8,7 @@ source "$(dirname "$0")/common.sh"
 task=${1:-lift}
 output=${2:-outputs/$task}
 env=(--env.type=robomimic --env.task="$task")
+settings "$output"
 
 record "$output/many" "$MANY" 10000 "${env[@]}"
 record "$output/few" "$FEW" 5000 "${env[@]}" --skill="$SKILL"

@@ -4,10 +4,14 @@ import json
 import sys
 
 import pytest
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import PushtEnv
+from lerobot.policies import make_pre_post_processors
 
 from lerobot_agpd.analysis.evaluation import Checkpoint, Environments
 from lerobot_agpd.cli import report as command
+from lerobot_agpd.policies.agpd_diffusion.modeling_agpd_diffusion import AGPDDiffusionPolicy
 
 pytest.importorskip("gym_pusht")
 
@@ -66,3 +70,59 @@ def test_nothing_to_report_and_missing_folders_are_named(tmp_path):
         command.ReportConfig(env=PushtEnv(), output=tmp_path)
     with pytest.raises(FileNotFoundError, match="'a': .*missing does not exist"):
         command.ReportConfig(env=PushtEnv(), output=tmp_path, policies={"a": tmp_path / "missing"})
+
+
+@pytest.mark.parametrize(
+    ("options", "flag"),
+    [
+        ({"episodes": 1}, "--episodes must be at least 2"),
+        ({"curve_episodes": 1}, "--curve_episodes must be 0 or at least 2"),
+        ({"batch_size": 0}, "--batch_size"),
+        ({"seed": 1000}, "--seed=1000: .*training and collection never use"),
+        ({"n_action_steps": [4, 5]}, "n_action_steps=5: .* was trained to execute 4"),
+    ],
+)
+def test_what_cannot_work_is_refused_before_anything_is_evaluated(tmp_path, student, options, flag):
+    with pytest.raises(ValueError, match=flag):
+        command.ReportConfig(env=PushtEnv(), output=tmp_path, policies={"a": student}, **options)
+
+
+def test_a_policy_that_samples_does_so_reproducibly(tmp_path, agpd_diffusion_config):
+    """Twice the same episodes, whatever was drawn before."""
+    inputs = {
+        "observation.state": PolicyFeature(FeatureType.STATE, (2,)),
+        "observation.environment_state": PolicyFeature(FeatureType.ENV, (16,)),
+    }
+    config = agpd_diffusion_config(input_features=inputs)
+    AGPDDiffusionPolicy(config).save_pretrained(tmp_path)
+    stats = {
+        key: {"min": torch.zeros(size), "max": torch.full((size,), 512.0)}
+        for key, size in (("observation.state", 2), ("observation.environment_state", 16), ("action", 2))
+    }
+    for processor in make_pre_post_processors(config, dataset_stats=stats):
+        processor.save_pretrained(tmp_path)
+    env = PushtEnv(obs_type="environment_state_agent_pos", episode_length=12)
+    found = []
+    for _ in range(2):
+        torch.rand(3)
+        with Environments(env, n_envs=2) as environments:
+            found.append(Checkpoint(tmp_path, "cpu").evaluate(environments, 2, 100_000))
+    assert found[0] == found[1]
+
+
+def test_finished_evaluations_are_written_before_one_fails(monkeypatch, tmp_path, student):
+    done = []
+
+    def second_fails(name, *rest):
+        if done:
+            raise ValueError("the second one")
+        done.append(name)
+        return evaluate_policy(name, *rest)
+
+    evaluate_policy = command.evaluate_policy
+    monkeypatch.setattr(command, "evaluate_policy", second_fails)
+    with pytest.raises(SystemExit, match="the second one"):
+        reported(monkeypatch, tmp_path / "out", f"--policies={{a: {student}, b: {student}}}")
+    assert [row["name"] for row in json.loads((tmp_path / "out" / "report.json").read_text())["methods"]] == [
+        "a"
+    ]

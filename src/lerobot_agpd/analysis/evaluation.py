@@ -11,6 +11,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors
 from lerobot.policies import PreTrainedPolicy, get_policy_class, make_pre_post_processors
 from lerobot.scripts.lerobot_eval import eval_policy
+from lerobot.utils.random_utils import seeded_context
 
 from lerobot_agpd.analysis.latency import Latency, chunk_latency
 
@@ -72,17 +73,8 @@ class Checkpoint:
         Raises:
             ValueError: if it cannot execute that many.
         """
-        config: Any = PreTrainedConfig.from_pretrained(path)
+        self.config = config = checkpoint_config(path, n_action_steps)
         config.device = device
-        if n_action_steps is not None:
-            if not 1 <= n_action_steps <= config.n_action_steps:
-                raise ValueError(
-                    f"n_action_steps={n_action_steps}: {path} was trained to execute {config.n_action_steps} steps per "
-                    "prediction; it can execute fewer, at least 1, not more"
-                )
-            config.n_action_steps = n_action_steps
-        config.pretrained_path = Path(path)
-        self.config = config
         self.policy: PreTrainedPolicy = get_policy_class(config.type).from_pretrained(path, config=config)
         self.preprocessor, self.postprocessor = make_pre_post_processors(
             config,
@@ -91,11 +83,11 @@ class Checkpoint:
         )
 
     def evaluate(self, environments: Environments, n_episodes: int, start_seed: int) -> Evaluation:
-        """Roll out n_episodes from consecutive seeds, as `lerobot-eval` does."""
+        """Roll out n_episodes from consecutive seeds, as `lerobot-eval` does; policies that sample do so reproducibly."""
         processors = make_env_pre_post_processors(environments.config, self.config)
         episodes: list[dict[str, Any]] = []
         for envs in environments.vectors:
-            with torch.no_grad():
+            with torch.no_grad(), seeded_context(start_seed):
                 info = eval_policy(
                     envs,
                     self.policy,
@@ -115,6 +107,24 @@ class Checkpoint:
     def latency(self) -> Latency:
         """Time of one chunk at batch size 1."""
         return chunk_latency(self.policy)
+
+
+def checkpoint_config(path: Path | str, n_action_steps: int | None = None) -> Any:
+    """Configuration of a checkpoint that is to execute a number of steps per prediction; None: its own.
+
+    Raises:
+        ValueError: if it cannot execute that many.
+    """
+    config: Any = PreTrainedConfig.from_pretrained(path)
+    if n_action_steps is not None:
+        if not 1 <= n_action_steps <= config.n_action_steps:
+            raise ValueError(
+                f"n_action_steps={n_action_steps}: {path} was trained to execute {config.n_action_steps} steps per "
+                "prediction; it can execute fewer, at least 1, not more"
+            )
+        config.n_action_steps = n_action_steps
+    config.pretrained_path = Path(path)
+    return config
 
 
 def checkpoint_steps(run: Path) -> dict[int, Path]:

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,16 @@ from lerobot.utils.utils import init_logging
 from rich.console import Console
 from rich.table import Table
 
-from lerobot_agpd.analysis.evaluation import Checkpoint, Environments, checkpoint_steps
+from lerobot_agpd.analysis.evaluation import (
+    Checkpoint,
+    Environments,
+    checkpoint_config,
+    checkpoint_steps,
+)
 from lerobot_agpd.analysis.report import HEADER, MethodResult, markdown, plot_curves, table_rows
 from lerobot_agpd.analysis.statistics import success_rate
+from lerobot_agpd.collect.config import EVALUATION_SEEDS
+from lerobot_agpd.guidance.config import require
 from lerobot_agpd.replay.store import ReplayStore
 
 logger = logging.getLogger(__name__)
@@ -47,11 +55,32 @@ class ReportConfig:
         for name, path in {**self.runs, **self.policies}.items():
             if not Path(path).exists():
                 raise FileNotFoundError(f"'{name}': {path} does not exist")
+        require(self.episodes >= 2, f"--episodes must be at least 2, got {self.episodes}")
+        require(
+            self.curve_episodes == 0 or self.curve_episodes >= 2,
+            f"--curve_episodes must be 0 or at least 2, got {self.curve_episodes}",
+        )
+        require(self.batch_size >= 1, f"--batch_size must be at least 1, got {self.batch_size}")
+        low, high = EVALUATION_SEEDS
+        require(
+            low <= self.seed and self.seed + max(self.episodes, self.curve_episodes) <= high,
+            f"--seed={self.seed}: environments of an evaluation lie in [{low}, {high}), which training and collection "
+            "never use",
+        )
+        for path in (*self.policies.values(), *(last_checkpoint(run) for run in self.runs.values())):
+            for n_steps in self.n_action_steps:
+                checkpoint_config(path, n_steps)
 
     @property
     def replanning(self) -> list[int | None]:
         """Steps executed per prediction, one row each; None is the checkpoint's own number."""
         return [*self.n_action_steps] or [None]
+
+
+def last_checkpoint(run: Path) -> Path:
+    """The policy of a run's last checkpoint."""
+    steps = checkpoint_steps(run)
+    return steps[max(steps)]
 
 
 def evaluate_run(
@@ -100,24 +129,8 @@ def show(results: list[MethodResult]) -> None:
     Console().print(table)
 
 
-@draccus.wrap()
-def run(config: ReportConfig) -> None:
-    """Evaluate, write and show."""
-    with Environments(config.env, min(config.batch_size, config.episodes)) as environments:
-        results = [
-            result
-            for name, path in config.policies.items()
-            for result in evaluate_policy(name, path, environments, config)
-        ]
-        results += [
-            result
-            for name, path in config.runs.items()
-            for result in evaluate_run(name, path, environments, config)
-        ]
-    rounds: list[dict[str, Any]] = next(
-        (result.collection["rounds"] for result in results if result.collection), []
-    )
-    config.output.mkdir(parents=True, exist_ok=True)
+def write(results: list[MethodResult], config: ReportConfig) -> None:
+    """Write what is known so far."""
     content = {
         "environment": draccus.encode(config.env, EnvConfig),
         "first_seed": config.seed,
@@ -125,6 +138,21 @@ def run(config: ReportConfig) -> None:
     }
     (config.output / "report.json").write_text(json.dumps(content, default=str) + "\n")
     (config.output / "report.md").write_text(markdown(results))
+
+
+@draccus.wrap()
+def run(config: ReportConfig) -> None:
+    """Evaluate, write and show."""
+    config.output.mkdir(parents=True, exist_ok=True)
+    results: list[MethodResult] = []
+    with Environments(config.env, min(config.batch_size, config.episodes)) as environments:
+        for entries, evaluate in ((config.policies, evaluate_policy), (config.runs, evaluate_run)):
+            for name, path in entries.items():
+                results += evaluate(name, path, environments, config)
+                write(results, config)
+    rounds: list[dict[str, Any]] = next(
+        (result.collection["rounds"] for result in results if result.collection), []
+    )
     plot_curves(results, rounds, config.output / "curves.png", config.title)
     show(results)
     logger.info("wrote report.json, report.md and curves.png to %s", config.output)
@@ -134,7 +162,10 @@ def main() -> None:
     """Console entry point."""
     init_logging()
     register_third_party_plugins()
-    run()
+    try:
+        run()
+    except (ValueError, FileNotFoundError) as error:
+        sys.exit(f"lerobot-agpd-report: {error}")
 
 
 if __name__ == "__main__":

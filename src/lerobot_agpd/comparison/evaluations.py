@@ -13,7 +13,6 @@ import draccus
 import numpy as np
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.envs import EnvConfig
-from lerobot.utils.random_utils import seeded_context
 
 from lerobot_agpd.analysis.evaluation import Checkpoint, Environments, Evaluation, checkpoint_steps
 from lerobot_agpd.analysis.statistics import success_rate
@@ -66,8 +65,7 @@ class Evaluator:
         known = read_evaluation(file, request)
         if known is not None:
             return known
-        with seeded_context(seed):  # policies that sample do so reproducibly
-            evaluation = Checkpoint(path, self.entry.device).evaluate(self.environments, episodes, seed)
+        evaluation = Checkpoint(path, self.entry.device).evaluate(self.environments, episodes, seed)
         write_json(file, {"request": request, **asdict(evaluation)})
         logger.info("evaluated %s %s: success %s", path, name, success_rate(evaluation.successes))
         return evaluation
