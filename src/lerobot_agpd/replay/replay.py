@@ -45,6 +45,10 @@ class Replay:
         self._raw: FrameTable | None = None
         self._sources: list[tuple[int, LeRobotDataset]] = [(0, memory.dataset)]
         self._tasks: dict[int, list[str]] = {0: _tasks(memory.dataset)}
+        self._n_dropped: int = getattr(config, "drop_n_last_frames", 0)  # ACT has no such setting
+        self._drawn = torch.empty(
+            0, dtype=torch.long
+        )  # collected rows that may begin a chunk, numbered from 0
         self._action_offsets = torch.as_tensor(config.chunk_offsets)
         self._n_obs_steps: int | None = config.observation_history
         self._cameras = list(config.image_features)
@@ -87,6 +91,13 @@ class Replay:
         self._sources.append((start, dataset))
         self._tasks[start] = _tasks(dataset)
         self.collected_raw = frames if self.collected_raw is None else self.collected_raw.concatenated(frames)
+        self._drawn = self.collected_raw.rows_before_end(self._n_dropped)
+        if not len(frames.rows_before_end(self._n_dropped)):
+            logger.warning(
+                "no episode in %s is longer than --policy.drop_n_last_frames=%d: none is trained on",
+                root,
+                self._n_dropped,
+            )
         self._table = self._raw = None
 
     # ---- rows ----
@@ -98,16 +109,17 @@ class Replay:
 
     def share(self) -> float:
         """Share of rows that collected frames fill."""
-        if self.n_collected_frames == 0:
+        if len(self._drawn) == 0:
             return 0.0
         if self.collected_share is not None:
             return self.collected_share
+        # Uniform over the frames that begin a chunk: on both sides, an episode's dropped ones count for nothing.
         episodes = self.memory.dataset.meta.episodes
         lengths = torch.as_tensor(episodes["dataset_to_index"]) - torch.as_tensor(
             episodes["dataset_from_index"]
         )
-        demonstrated = int(lengths[sorted(self.seen_episodes)].sum())
-        return self.n_collected_frames / (demonstrated + self.n_collected_frames)
+        demonstrated = int((lengths[sorted(self.seen_episodes)] - self._n_dropped).clamp(min=0).sum())
+        return len(self._drawn) / (demonstrated + len(self._drawn))
 
     def training_rows(self, batch: Batch, generator: torch.Generator) -> Batch:
         """Rows of T for a training step: the loader's frames, a share exchanged for collected ones."""
@@ -115,8 +127,8 @@ class Replay:
         exchanged = torch.rand(len(rows), generator=generator) < self.share()
         n_exchanged = int(exchanged.sum())
         if n_exchanged:
-            draws = torch.randint(self.n_collected_frames, (n_exchanged,), generator=generator)
-            rows[exchanged.to(rows.device)] = (self.n_demonstration_frames + draws).to(rows)
+            drawn = self._drawn[torch.randint(len(self._drawn), (n_exchanged,), generator=generator)]
+            rows[exchanged.to(rows.device)] = (self.n_demonstration_frames + drawn).to(rows)
         return self._gather(batch, rows)
 
     def demonstration_rows(self, batch: Batch) -> Batch:
