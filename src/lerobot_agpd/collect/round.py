@@ -132,7 +132,7 @@ class RoundRunner:
         )
         try:
             for position, envs in enumerate(environments):
-                rollouts = Rollouts(envs, processors, decider, self.config.rollin)
+                rollouts = Rollouts(envs, processors, decider, self.config.rollin, self.writer.check)
                 for episode in rollouts.run(tickets[position :: len(environments)]):
                     with decider.stopwatch.measure("writing"):
                         spool.add(episode, self.filter.judge(episode))

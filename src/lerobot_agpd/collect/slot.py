@@ -78,8 +78,7 @@ class Slot:
             ticket=self.ticket,
             task=task,
             observations={
-                key: np.stack([_as_recorded(step[key]) for step in self._observations[first:]])
-                for key in keys
+                key: np.stack([as_recorded(step[key]) for step in self._observations[first:]]) for key in keys
             },
             actions=np.stack(self._actions[first:]).astype(np.float32),
             rewards=np.array(self._rewards[first:], dtype=np.float32),
@@ -91,7 +90,7 @@ class Slot:
         )
 
 
-def _as_recorded(value: Tensor) -> Array:
+def as_recorded(value: Tensor) -> Array:
     """Vectors as float32, images (C, H, W) in [0, 1] as uint8 (H, W, C)."""
     if value.ndim == 3:
         return (value * 255).round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()
