@@ -1,6 +1,7 @@
 """Collected episodes on disk: interrupted, continued, finished, merged."""
 
 import json
+import weakref
 
 import numpy as np
 import pytest
@@ -117,7 +118,7 @@ def test_spool_remembers(store):
     reopened = ReplayStore(store.root).spool(0, 0)
     assert list(reopened.records) == [2, 0, 1]
     assert all(same(reopened.records[r.ticket.number], record(r)) for r in rollouts)
-    kept = reopened.kept()
+    kept = list(reopened.kept())
     assert [rollout.ticket.number for rollout in kept] == [0, 2]
     assert equal_episodes(kept[0], rollouts[1]) and equal_episodes(kept[1], rollouts[0])
 
@@ -142,9 +143,24 @@ def test_arrays_without_a_record_do_not_count(store):
     episode(0).save(spool.arrays / "episode-000000.npz")
     (spool.arrays / "episode-000001.partial.npz").write_bytes(b"half")
     again = store.spool(0, 0)
-    assert not again.records and not again.kept()
+    assert not again.records and not list(again.kept())
     again.add(episode(0), record(episode(0)))
-    assert len(again.kept()) == 1
+    assert len(list(again.kept())) == 1
+
+
+def test_kept_episodes_are_in_memory_one_at_a_time(store, write, monkeypatch):
+    """The one that is being written, and the next one that is being read."""
+    alive, load = [], Episode.load
+
+    def watched(path, entry):
+        loaded = load(path, entry)
+        alive.append(weakref.ref(loaded))
+        assert sum(reference() is not None for reference in alive) <= 2
+        return loaded
+
+    monkeypatch.setattr(Episode, "load", watched)
+    write(store, 0, [episode(number) for number in range(5)])
+    assert len(alive) == 5
 
 
 # ---- rounds ----

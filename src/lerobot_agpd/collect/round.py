@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -164,9 +164,9 @@ class RoundRunner:
             states = state_diagnostics(self._kept(number), stats, config, seed)
         return {"actions": actions, "states": states, "seconds": stopwatch.seconds["diagnostics"]}
 
-    def _kept(self, number: int) -> list[Episode]:
-        spools = [self.store.spool(number, rank) for rank in range(self.n_ranks)]
-        return [episode for spool in spools for episode in spool.kept()]
+    def _kept(self, number: int) -> Iterator[Episode]:
+        for rank in range(self.n_ranks):
+            yield from self.store.spool(number, rank).kept()
 
     def report(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -68,15 +68,29 @@ class EpisodeWriter:
                 logger.warning("collected episodes lack the demonstrations' feature '%s'", key)
         return {**chosen, **{key: dict(feature) for key, feature in ROUND_FEATURES.items()}}
 
-    def write(self, root: Path, episodes: Sequence[Episode], number: int, strategy: str) -> None:
-        """Write and finalise a dataset of at least one episode in a new folder.
+    def write(self, root: Path, episodes: Iterable[Episode], number: int, strategy: str) -> None:
+        """Write and finalise a dataset of at least one episode in a new folder; episodes are taken one by one.
 
         Raises:
             ValueError: if an observation has another shape than in the demonstrations.
         """
-        self.check({key: values[0] for key, values in episodes[0].observations.items()})
-        features = self.features(self._columns(episodes[0], number, strategy))
-        dataset = LeRobotDataset.create(
+        dataset: LeRobotDataset | None = None
+        for episode in episodes:
+            columns = self._columns(episode, number, strategy)
+            if dataset is None:
+                self.check({key: values[0] for key, values in episode.observations.items()})
+                features = self.features(columns)
+                dataset = self._create(root, features)
+            typed = {key: _cast(columns[key], feature) for key, feature in features.items()}
+            for step in range(len(episode)):
+                frame = {key: column[step] for key, column in typed.items()}
+                dataset.add_frame({**frame, "task": episode.task or self._task()})
+            dataset.save_episode()
+        assert dataset is not None
+        dataset.finalize()
+
+    def _create(self, root: Path, features: dict[str, dict[str, Any]]) -> LeRobotDataset:
+        return LeRobotDataset.create(
             repo_id=f"agpd/{root.parent.name}-{root.name}",
             fps=self.demonstrations.fps,
             features=features,
@@ -84,14 +98,6 @@ class EpisodeWriter:
             robot_type=self.demonstrations.robot_type,
             use_videos=bool(self.demonstrations.video_keys),
         )
-        for episode in episodes:
-            recorded = self._columns(episode, number, strategy)
-            columns = {key: _cast(recorded[key], feature) for key, feature in features.items()}
-            for step in range(len(episode)):
-                frame = {key: column[step] for key, column in columns.items()}
-                dataset.add_frame({**frame, "task": episode.task or self._task()})
-            dataset.save_episode()
-        dataset.finalize()
 
     def _columns(self, episode: Episode, number: int, strategy: str) -> dict[str, Any]:
         n_steps = len(episode)
