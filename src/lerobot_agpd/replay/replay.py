@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +33,21 @@ class Replay:
         config: the student's configuration; its `chunk_offsets` are the steps of a chunk relative to the current
             one, its `observation_history` the steps of an observation (None: no time dimension).
         collected_share: share of rows exchanged; None draws uniformly from T.
+        image_transforms: what the loader does to the training images (..., C, H, W) in [0, 1] that it delivers; T does
+            it to those that it reads itself.
     """
 
-    def __init__(self, memory: FrameMemory, config: Any, collected_share: float | None):
+    def __init__(
+        self,
+        memory: FrameMemory,
+        config: Any,
+        collected_share: float | None,
+        image_transforms: Callable[[Tensor], Tensor] | None = None,
+    ):
         self.memory = memory
         self.config = config
         self.collected_share = collected_share
+        self.image_transforms = image_transforms
         self.collected_raw: FrameTable | None = None
         self.seen_episodes: set[int] = set()
         self._table: FrameTable | None = None
@@ -46,9 +55,7 @@ class Replay:
         self._sources: list[tuple[int, LeRobotDataset]] = [(0, memory.dataset)]
         self._tasks: dict[int, list[str]] = {0: _tasks(memory.dataset)}
         self._n_dropped: int = getattr(config, "drop_n_last_frames", 0)  # ACT has no such setting
-        self._drawn = torch.empty(
-            0, dtype=torch.long
-        )  # collected rows that may begin a chunk, numbered from 0
+        self._drawn = torch.empty(0, dtype=torch.long)  # rows of `collected_raw` that may begin a chunk
         self._action_offsets = torch.as_tensor(config.chunk_offsets)
         self._n_obs_steps: int | None = config.observation_history
         self._cameras = list(config.image_features)
@@ -129,27 +136,37 @@ class Replay:
         if n_exchanged:
             drawn = self._drawn[torch.randint(len(self._drawn), (n_exchanged,), generator=generator)]
             rows[exchanged.to(rows.device)] = (self.n_demonstration_frames + drawn).to(rows)
-        return self._gather(batch, rows)
+        return self._gather(batch, rows, augment=True)
 
     def demonstration_rows(self, batch: Batch) -> Batch:
         """The loader's frames with their chunks, for a held-out loss."""
         return self._gather(batch, batch["index"])
 
-    def _gather(self, batch: Batch, rows: Tensor) -> Batch:
+    def _gather(self, batch: Batch, rows: Tensor, augment: bool = False) -> Batch:
         gathered = gather_rows(self.table, rows, self.config, self._action_offsets, self._n_obs_steps)
-        images = {key: self._images(batch, rows, key) for key in self._cameras}
+        images = {key: self._images(batch, rows, key, augment) for key in self._cameras}
         return {**images, **gathered, ROW: rows}
 
-    def _images(self, batch: Batch, rows: Tensor, key: str) -> Tensor:
+    def _images(self, batch: Batch, rows: Tensor, key: str, augment: bool) -> Tensor:
         """A camera's normalised frames at `rows`; those that the loader did not deliver are read from disk."""
         normalise = self.memory.normaliser.normalise
         if self._n_obs_steps is not None:
-            return normalise(key, self.history(rows, [key], self._n_obs_steps)[key]).to(batch[key])
+            images = self.history(rows, [key], self._n_obs_steps)[key]
+            if augment:
+                images = torch.stack([self._augmented(key, history) for history in images])
+            return normalise(key, images).to(batch[key])
         exchanged = (rows != batch["index"]).nonzero()[:, 0].tolist()
         images = batch[key].clone() if exchanged else batch[key]
         for position in exchanged:
-            images[position] = normalise(key, self.image(int(rows[position]), key)).to(images)
+            image = self._augmented(key, self.image(int(rows[position]), key))
+            images[position] = normalise(key, image).to(images)
         return images
+
+    def _augmented(self, key: str, image: Tensor) -> Tensor:
+        """A camera's frame or history (..., C, H, W) as the loader delivers it in training: one draw for all of it."""
+        if self.image_transforms is None or key in self.memory.dataset.meta.depth_keys:
+            return image
+        return self.image_transforms(image)
 
     # ---- single frames ----
 
