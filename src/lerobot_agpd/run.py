@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, fields
@@ -18,6 +18,8 @@ import yaml
 from lerobot.configs import parser
 from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 from lerobot.envs import EnvConfig
+from lerobot.transforms import ImageTransforms, ImageTransformsConfig
+from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -29,12 +31,14 @@ class RunInfo:
         env: the evaluation environment, or None.
         steps: number of training steps; None if a run that was declared did not say.
         resume: whether the run continues a checkpoint.
+        image_transforms: what the loader does to training images (..., C, H, W), or None.
     """
 
     output_dir: Path | None = None
     env: EnvConfig | None = None
     steps: int | None = None
     resume: bool = False
+    image_transforms: Callable[[Tensor], Tensor] | None = None
 
 
 _declared: ContextVar[RunInfo | None] = ContextVar("declared_run", default=None)
@@ -64,6 +68,7 @@ def this_run() -> RunInfo:
         env=_env(config.get("env")),
         steps=int(steps),
         resume=resume if isinstance(resume, bool) else draccus.decode(bool, yaml.safe_load(resume)),
+        image_transforms=_image_transforms(config.get("dataset")),
     )
 
 
@@ -101,14 +106,22 @@ def _env(config: dict[str, Any] | None) -> EnvConfig | None:
         return None
     if chosen != entry.pop("type", None):
         entry = {}  # another type on the command line: the file's fields are not its fields
+    return _group(EnvConfig.get_choice_class(chosen), entry, "env")
+
+
+def _image_transforms(config: dict[str, Any] | None) -> ImageTransforms | None:
+    """The transforms of `--dataset.image_transforms.*`, as LeRobot's `make_dataset` builds them."""
+    entry = (config or {}).get("image_transforms") or {}
+    transforms = _group(ImageTransformsConfig, entry, "dataset.image_transforms")
+    return ImageTransforms(transforms) if transforms.enable else None
+
+
+def _group(kind: type, entry: dict[str, Any], name: str) -> Any:
+    """A group of flags: the config file's entry, and what the command line says of `--<name>.*` over it."""
     with tempfile.NamedTemporaryFile("w", suffix=".json") as file, draccus.config_type("json"):
         json.dump(entry, file)
         file.flush()
-        return draccus.parse(
-            EnvConfig.get_choice_class(chosen),
-            config_path=file.name,
-            args=parser.get_cli_overrides("env") or [],
-        )
+        return draccus.parse(kind, config_path=file.name, args=parser.get_cli_overrides(name) or [])
 
 
 def barrier() -> None:

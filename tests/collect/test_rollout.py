@@ -211,6 +211,26 @@ def test_environment_that_does_not_report_success():
     assert episode.successes is None and episode.success is None
 
 
+def test_every_first_observation_is_checked_before_a_step_is_taken():
+    run, seen = rollouts(2, Decider()), []
+    run.check = seen.append
+    list(run.run(tickets([2, 1, 1])))
+    assert [observation["observation.state"].tolist() for observation in seen] == [
+        [200, 0],
+        [101, 0],
+        [102, 0],
+    ]
+
+    def refuse(observation):
+        raise ValueError("another shape")
+
+    run = rollouts(2, Decider())
+    run.check = refuse
+    with pytest.raises(ValueError, match="another shape"):
+        list(run.run(tickets([2])))
+    assert run.envs.n_steps == 0
+
+
 def test_no_tickets_no_steps():
     run = rollouts(2, Decider())
     assert list(run.run([])) == [] and run.envs.n_steps == run.envs.n_resets == 0

@@ -217,6 +217,16 @@ def test_rollin_records_the_teachers_part(tmp_path, demonstrations):
         assert len(episode) == record.length and episode.student_steps == record.student_steps
 
 
+def test_an_environment_that_does_not_fit_is_refused_before_the_first_rollout(tmp_path):
+    """Not after a round of them, when the dataset is written."""
+    other = {**FEATURES, "observation.environment_state": {"dtype": "float32", "shape": (3,), "names": None}}
+    dataset = LeRobotDataset.create("local/other", fps=10, features=other, root=tmp_path / "other")
+    rounds = Rounds(tmp_path / "rounds", dataset.meta, strategy="guided")
+    with pytest.raises(ValueError, match=r"'observation.environment_state' with shape \(16,\).*\(3,\)"):
+        rounds.collect()
+    assert not rounds.store.spool(0, 0).records
+
+
 def test_spools_of_older_rounds_are_read(tmp_path, demonstrations):
     """Their records know nothing of the student's part and of retries."""
     rounds = Rounds(tmp_path, demonstrations, strategy="guided")

@@ -55,6 +55,18 @@ def test_a_diffusion_student_keeps_its_past_steps(rows_of, agpd_diffusion_config
     assert torch.equal(rows["action"][:, 1:], chunks)
 
 
+def test_a_teacher_with_a_shorter_chunk_needs_the_masked_loss(rows_of, agpd_diffusion_config):
+    """The teacher's 16 steps are 15 from now on, the student's 24 are 23."""
+    message = r"relabel=all.* 15 steps.* has 23.*--policy.do_mask_loss_for_padding=true"
+    with pytest.raises(ValueError, match=message):
+        rows_of(AGPDDiffusionPolicy, agpd_diffusion_config(horizon=24), "all")
+    masked = agpd_diffusion_config(horizon=24, do_mask_loss_for_padding=True)
+    rows, _ = rows_of(AGPDDiffusionPolicy, masked, "all")
+    assert not rows["action_is_pad"][:, 1:16].any() and rows["action_is_pad"][:, 16:].all()
+    rows_of(AGPDDiffusionPolicy, agpd_diffusion_config(horizon=16), "all")  # as long as the teacher's
+    rows_of(AGPDDiffusionPolicy, agpd_diffusion_config(horizon=24), "none")  # nothing exchanged
+
+
 def test_relabelling_needs_a_teacher(demonstrations, agpd_diffusion_config):
     config = agpd_diffusion_config(replay=ReplayConfig(relabel="all"))
     policy = AGPDDiffusionPolicy(config, demonstrations.meta.stats, demonstrations.meta)

@@ -109,6 +109,7 @@ def test_distillation_from_pixels(tmp_path: Path) -> None:
         "--policy.collect.episodes=3",
         "--policy.collect.min_reward=0.9",
         "--policy.replay.collected_share=0.5",
+        "--dataset.image_transforms.enable=true",
         "--policy.adversary.start=2",
         "--batch_size=8",
         "--log_freq=1",

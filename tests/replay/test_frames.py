@@ -3,6 +3,7 @@
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.sampler import EpisodeAwareSampler
 
 from lerobot_agpd.replay.frames import FrameTable
 
@@ -42,6 +43,21 @@ def test_gather_by_hand():
     values, is_pad = table.gather("x", torch.tensor([1, 2, 1]), torch.tensor([-1, 0, 1, 2]))
     assert values[..., 0].tolist() == [[0, 1, 1, 1], [2, 2, 3, 4], [0, 1, 1, 1]]
     assert is_pad.int().tolist() == [[0, 0, 1, 1], [1, 0, 0, 0], [0, 0, 1, 1]]
+
+
+@pytest.mark.parametrize("n_steps", [0, 1, 2, 3, 6])
+def test_rows_before_the_end_are_those_of_lerobots_sampler(demonstrations, table, n_steps):
+    sides = (demonstrations.meta.episodes[f"dataset_{side}_index"] for side in ("from", "to"))
+    sampler = EpisodeAwareSampler(*sides, drop_n_last_frames=n_steps)
+    assert table.rows_before_end(n_steps).tolist() == sampler.indices
+
+
+def test_rows_before_the_end_by_hand():
+    table = FrameTable.from_episode_lengths({"x": torch.zeros(7, 1)}, [4, 3])
+    assert table.rows_before_end(0).tolist() == list(range(7))
+    assert table.rows_before_end(2).tolist() == [0, 1, 4]
+    assert table.rows_before_end(3).tolist() == [0], "an episode of 3 frames contributes none"
+    assert table.rows_before_end(4).tolist() == []
 
 
 def test_concatenation_keeps_episodes_apart():

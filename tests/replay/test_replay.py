@@ -150,6 +150,26 @@ def test_exchanged_rows_are_collected_frames_and_the_rest_the_loaders(
         assert is_pad.tolist() == [step + k >= len(source) for k in range(4)]
 
 
+def test_a_diffusion_student_draws_no_dropped_frame(
+    demonstrations, agpd_config, agpd_diffusion_config, deliver, collected
+):
+    """With the last 3 dropped, the episode of 4 frames begins one chunk, that of 3 none."""
+    config = agpd_diffusion_config(normalization_mapping=agpd_config().normalization_mapping)
+    assert config.drop_n_last_frames == 3
+    memory = FrameMemory(config, demonstrations.meta, demonstrations.meta.stats)
+    uniform, fixed = (Replay(memory, config, share) for share in (None, 0.5))
+    batch = deliver([0, 1, 5, 6] * 20)
+    for replay in (uniform, fixed):
+        replay.observe(batch)
+        replay.add_dataset(collected[1])
+        assert replay.share() == 0.0, "nothing to fill it with"
+        replay.add_dataset(collected[0])
+        rows = replay.training_rows(batch, generator())[ROW]
+        assert set(rows[rows >= N_DEMONSTRATED].tolist()) == {N_DEMONSTRATED + COLLECTED[1]}
+    assert fixed.share() == 0.5
+    assert uniform.share() == pytest.approx(1 / ((5 - 3) + 0 + (7 - 3) + 1))
+
+
 def test_rows_depend_on_the_generator_alone(make_replay, deliver, collected):
     replay = make_replay(share=0.5)
     replay.add_dataset(collected[0])

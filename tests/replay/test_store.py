@@ -2,6 +2,7 @@
 
 import json
 import sys
+import weakref
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_agpd.cli import merge
 from lerobot_agpd.replay.episode import Episode, EpisodeRecord, Ticket
+from lerobot_agpd.replay.frames import FrameTable
 from lerobot_agpd.replay.store import ReplayStore
 from lerobot_agpd.replay.writer import EpisodeWriter
 
@@ -118,7 +120,7 @@ def test_spool_remembers(store):
     reopened = ReplayStore(store.root).spool(0, 0)
     assert list(reopened.records) == [2, 0, 1]
     assert all(same(reopened.records[r.ticket.number], record(r)) for r in rollouts)
-    kept = reopened.kept()
+    kept = list(reopened.kept())
     assert [rollout.ticket.number for rollout in kept] == [0, 2]
     assert equal_episodes(kept[0], rollouts[1]) and equal_episodes(kept[1], rollouts[0])
 
@@ -143,9 +145,24 @@ def test_arrays_without_a_record_do_not_count(store):
     episode(0).save(spool.arrays / "episode-000000.npz")
     (spool.arrays / "episode-000001.partial.npz").write_bytes(b"half")
     again = store.spool(0, 0)
-    assert not again.records and not again.kept()
+    assert not again.records and not list(again.kept())
     again.add(episode(0), record(episode(0)))
-    assert len(again.kept()) == 1
+    assert len(list(again.kept())) == 1
+
+
+def test_kept_episodes_are_in_memory_one_at_a_time(store, write, monkeypatch):
+    """The one that is being written, and the next one that is being read."""
+    alive, load = [], Episode.load
+
+    def watched(path, entry):
+        loaded = load(path, entry)
+        alive.append(weakref.ref(loaded))
+        assert sum(reference() is not None for reference in alive) <= 2
+        return loaded
+
+    monkeypatch.setattr(Episode, "load", watched)
+    write(store, 0, [episode(number) for number in range(5)])
+    assert len(alive) == 5
 
 
 # ---- rounds ----
@@ -299,3 +316,61 @@ def test_writer_leaves_out_what_the_environment_does_not_deliver(demonstrations,
     absent = {"observation.state", "observation.extra", "next.success"}
     assert not absent & set(dataset.features) and {"action", "next.reward"} <= set(dataset.features)
     assert int(dataset[0]["agpd.round"]) == 7 and dataset[0]["task"] == "a small task"
+
+
+def metadata(root, features):
+    """Metadata of a dataset that declares these features."""
+    return LeRobotDataset.create(
+        "local/declared", fps=10, features=features, root=root, use_videos=False
+    ).meta
+
+
+def test_writer_takes_over_dtypes_that_can_hold_what_was_recorded(demonstrations, tmp_path):
+    """float64 can; integers would cut float32 off and keep it, but have room for a success."""
+    declared = {
+        "observation.state": "float64",
+        "action": "float64",
+        "next.reward": "int64",
+        "next.success": "int64",
+    }
+    features = {
+        key: {**feature, "dtype": declared.get(key, feature["dtype"])}
+        for key, feature in demonstrations.features.items()
+        if key in (*declared, "observation.environment_state")
+    }
+    rollouts = [episode(0), episode(1, length=2)]
+    EpisodeWriter(metadata(tmp_path / "declared", features)).write(tmp_path / "d", rollouts, 0, "guided")
+    dataset = LeRobotDataset("local/x", root=tmp_path / "d")
+    expected = {**declared, "next.reward": "float32", "observation.environment_state": "float32"}
+    assert {key: dataset.features[key]["dtype"] for key in expected} == expected
+    columns = {"action": "actions", "next.reward": "rewards", "next.success": "successes"}
+    for key, name in columns.items():
+        written = np.stack(
+            [np.asarray(dataset.hf_dataset.with_format("numpy")[row][key]) for row in range(5)]
+        )
+        recorded = np.concatenate([getattr(rollout, name) for rollout in rollouts])
+        np.testing.assert_array_equal(written.reshape(recorded.shape), recorded)
+    frames = FrameTable.from_dataset(dataset, ["observation.state"])
+    states = np.concatenate([rollout.observations["observation.state"] for rollout in rollouts])
+    np.testing.assert_array_equal(frames.columns["observation.state"], states)
+
+
+@pytest.mark.parametrize(
+    ("shape", "names"),
+    [((4, 6, 3), ["height", "width", "channels"]), ((3, 4, 6), ["channels", "height", "width"])],
+)
+def test_writer_takes_images_in_either_declared_layout(demonstrations, tmp_path, shape, names):
+    features = {"observation.image": {"dtype": "image", "shape": shape, "names": names}}
+    features["action"] = demonstrations.features["action"]
+    rollout = episode(0)
+    images = np.random.default_rng(0).integers(0, 256, (3, 4, 6, 3), dtype=np.uint8)
+    rollout.observations = {"observation.image": images}
+    writer = EpisodeWriter(metadata(tmp_path / "declared", features))
+    writer.check({"observation.image": images[0]})
+    writer.write(tmp_path / "d", [rollout], 0, "guided")
+    dataset = LeRobotDataset("local/x", root=tmp_path / "d")
+    for step in range(3):
+        read = (dataset[step]["observation.image"] * 255).round().to(torch.uint8)
+        assert torch.equal(read, torch.from_numpy(images[step]).permute(2, 0, 1))
+    with pytest.raises(ValueError, match=r"'observation.image' with shape \(6, 4, 3\)"):
+        writer.check({"observation.image": images[0].swapaxes(0, 1)})

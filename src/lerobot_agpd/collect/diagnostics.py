@@ -7,7 +7,7 @@ Success rates say what a strategy costs; these numbers say what it buys: how far
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -114,7 +114,7 @@ def _rms(gap: Tensor) -> float:
 
 
 def state_diagnostics(
-    episodes: Sequence[Episode], stats: Statistics, config: DiagnosticsConfig, seed: int
+    episodes: Iterable[Episode], stats: Statistics, config: DiagnosticsConfig, seed: int
 ) -> dict[str, Any] | None:
     """How diverse the low-dimensional states of episodes are, in the demonstrations' standard deviations.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lerobot_agpd.collect.config import RollinConfig
 from lerobot_agpd.collect.decider import Decider
-from lerobot_agpd.collect.slot import Slot
+from lerobot_agpd.collect.slot import Slot, as_recorded
 from lerobot_agpd.guidance.teacher import TASK
 from lerobot_agpd.replay.episode import Array, Episode, Ticket
 
@@ -28,6 +28,7 @@ class Rollouts:
         processors: LeRobot's environment pre- and postprocessor.
         decider: the strategy; its stopwatch takes the environments' time too.
         rollin: what to make of the first part of an episode, in which the student acts.
+        check: raises if an episode's first observation (vectors (D,), images (H, W, C)) could not be kept.
     """
 
     def __init__(
@@ -36,11 +37,13 @@ class Rollouts:
         processors: tuple[Any, Any],
         decider: Decider,
         rollin: RollinConfig | None = None,
+        check: Callable[[Mapping[str, Array]], None] | None = None,
     ):
         self.envs = envs
         self.preprocess, self.postprocess = processors
         self.decider = decider
         self.rollin = rollin or RollinConfig()
+        self.check = check
         self.task = _task_description(envs)
         self._was_reset = False
 
@@ -85,7 +88,10 @@ class Rollouts:
         for number in fresh:
             slot = slots[number]
             if slot is not None:
-                slot.see(_row(observations, number))
+                observation = _row(observations, number)
+                if self.check is not None:
+                    self.check({key: as_recorded(value) for key, value in observation.items()})
+                slot.see(observation)
 
     def _student_steps(self, ticket: Ticket) -> int:
         """Steps after which the teacher takes over."""

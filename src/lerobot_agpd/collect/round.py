@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -162,7 +162,7 @@ class RoundRunner:
         )
         try:
             for position, envs in enumerate(environments):
-                rollouts = Rollouts(envs, processors, decider, self.config.rollin)
+                rollouts = Rollouts(envs, processors, decider, self.config.rollin, self.writer.check)
                 for episode in rollouts.run(tickets[position :: len(environments)]):
                     with decider.stopwatch.measure("writing"):
                         spool.add(episode, self.filter.judge(episode))
@@ -194,9 +194,9 @@ class RoundRunner:
             states = state_diagnostics(self._kept(number), stats, config, seed)
         return {"actions": actions, "states": states, "seconds": stopwatch.seconds["diagnostics"]}
 
-    def _kept(self, number: int) -> list[Episode]:
-        spools = [self.store.spool(number, rank) for rank in range(self.n_ranks)]
-        return [episode for spool in spools for episode in spool.kept()]
+    def _kept(self, number: int) -> Iterator[Episode]:
+        for rank in range(self.n_ranks):
+            yield from self.store.spool(number, rank).kept()
 
     def report(
         self,

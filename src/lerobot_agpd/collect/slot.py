@@ -29,7 +29,7 @@ class Slot:
         self.queue: deque[tuple[Tensor, Tensor]] = deque()
         self._student_steps = student_steps
         self._takeover: int | None = None  # step of the teacher's first decision
-        self._observations: list[dict[str, Tensor]] = []
+        self._observations: list[dict[str, Array]] = []
         self._actions: list[Array] = []
         self._rewards: list[float] = []
         self._successes: list[bool | None] = []
@@ -58,7 +58,8 @@ class Slot:
 
     def record(self, action: Array, reward: float, success: bool | None) -> None:
         """Append a step: the latest observation and what was done and came of it."""
-        self._observations.append(self.history[-1])
+        # As they will be kept: a float32 image takes four times the memory, and episodes are long.
+        self._observations.append({key: as_recorded(value) for key, value in self.history[-1].items()})
         self._actions.append(action)
         self._rewards.append(reward)
         self._successes.append(success)
@@ -77,10 +78,7 @@ class Slot:
         return Episode(
             ticket=self.ticket,
             task=task,
-            observations={
-                key: np.stack([_as_recorded(step[key]) for step in self._observations[first:]])
-                for key in keys
-            },
+            observations={key: np.stack([step[key] for step in self._observations[first:]]) for key in keys},
             actions=np.stack(self._actions[first:]).astype(np.float32),
             rewards=np.array(self._rewards[first:], dtype=np.float32),
             successes=None if None in successes else np.array(successes, dtype=bool),
@@ -91,7 +89,7 @@ class Slot:
         )
 
 
-def _as_recorded(value: Tensor) -> Array:
+def as_recorded(value: Tensor) -> Array:
     """Vectors as float32, images (C, H, W) in [0, 1] as uint8 (H, W, C)."""
     if value.ndim == 3:
         return (value * 255).round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()

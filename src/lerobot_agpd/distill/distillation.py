@@ -87,7 +87,8 @@ class Distillation:
         self.state = DistillationState.restore(self.config, self.run)
         memory = FrameMemory(self.config, dataset_meta, dataset_stats)
         self.demonstrations = memory.dataset.meta
-        self.replay = Replay(memory, self.config, self.config.replay.collected_share)
+        share, image_transforms = self.config.replay.collected_share, self.run.image_transforms
+        self.replay = Replay(memory, self.config, share, image_transforms)
         self.replay.seen_episodes.update(self.state.seen_episodes)
         self.own_teacher = make_own_teacher(student, self.state)
         self.teacher = None if self.own_teacher else make_teacher(student, self.demonstrations)

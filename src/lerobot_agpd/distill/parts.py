@@ -167,7 +167,18 @@ def check_steps(student: DistilledStudent, teacher: Teacher | None, demonstratio
 def make_teacher_chunks(
     config: Any, teacher: Teacher | None, replay: Replay, seed: int
 ) -> TeacherChunks | None:
-    """The teacher's chunks on T, if the adversary or relabelling uses them."""
+    """The teacher's chunks on T, if the adversary or relabelling uses them.
+
+    Raises:
+        ValueError: if relabelled chunks would end with recorded steps that the student's loss does not leave out.
+    """
     if teacher is None or (config.adversary.weight == 0 and config.replay.relabel == "none"):
         return None
+    masks_padding = getattr(config, "do_mask_loss_for_padding", True)  # without that setting: always, as ACT
+    if config.replay.relabel != "none" and not masks_padding and teacher.n_chunk_steps < future_steps(config):
+        raise ValueError(
+            f"--policy.replay.relabel={config.replay.relabel}: the teacher predicts {teacher.n_chunk_steps} steps from "
+            f"the current one on, the student's chunk has {future_steps(config)}, and its loss counts the recorded "
+            "steps behind the teacher's; pass --policy.do_mask_loss_for_padding=true, which leaves them out"
+        )
     return TeacherChunks(teacher, replay, future_steps(config), seed)

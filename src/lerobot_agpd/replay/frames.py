@@ -90,6 +90,11 @@ class FrameTable:
         is_pad = (rows < start) | (rows >= end)
         return self.columns[key][rows.clamp(min=start, max=end - 1)], is_pad
 
+    def rows_before_end(self, n_steps: int) -> Tensor:
+        """Rows (M,) that lie at least `n_steps` before the last frame of their episode, in order."""
+        rows = torch.arange(len(self), device=self.episode_end.device)
+        return rows[rows < self.episode_end - n_steps]
+
     def concatenated(self, other: FrameTable) -> FrameTable:
         """This table followed by another one with the same columns; rows of this table keep their numbers.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,18 +33,29 @@ class Replay:
         config: the student's configuration; its `chunk_offsets` are the steps of a chunk relative to the current
             one, its `observation_history` the steps of an observation (None: no time dimension).
         collected_share: share of rows exchanged; None draws uniformly from T.
+        image_transforms: what the loader does to the training images (..., C, H, W) in [0, 1] that it delivers; T does
+            it to those that it reads itself.
     """
 
-    def __init__(self, memory: FrameMemory, config: Any, collected_share: float | None):
+    def __init__(
+        self,
+        memory: FrameMemory,
+        config: Any,
+        collected_share: float | None,
+        image_transforms: Callable[[Tensor], Tensor] | None = None,
+    ):
         self.memory = memory
         self.config = config
         self.collected_share = collected_share
+        self.image_transforms = image_transforms
         self.collected_raw: FrameTable | None = None
         self.seen_episodes: set[int] = set()
         self._table: FrameTable | None = None
         self._raw: FrameTable | None = None
         self._sources: list[tuple[int, LeRobotDataset]] = [(0, memory.dataset)]
         self._tasks: dict[int, list[str]] = {0: _tasks(memory.dataset)}
+        self._n_dropped: int = getattr(config, "drop_n_last_frames", 0)  # ACT has no such setting
+        self._drawn = torch.empty(0, dtype=torch.long)  # rows of `collected_raw` that may begin a chunk
         self._action_offsets = torch.as_tensor(config.chunk_offsets)
         self._n_obs_steps: int | None = config.observation_history
         self._cameras = list(config.image_features)
@@ -87,6 +98,13 @@ class Replay:
         self._sources.append((start, dataset))
         self._tasks[start] = _tasks(dataset)
         self.collected_raw = frames if self.collected_raw is None else self.collected_raw.concatenated(frames)
+        self._drawn = self.collected_raw.rows_before_end(self._n_dropped)
+        if not len(frames.rows_before_end(self._n_dropped)):
+            logger.warning(
+                "no episode in %s is longer than --policy.drop_n_last_frames=%d: none is trained on",
+                root,
+                self._n_dropped,
+            )
         self._table = self._raw = None
 
     # ---- rows ----
@@ -98,16 +116,17 @@ class Replay:
 
     def share(self) -> float:
         """Share of rows that collected frames fill."""
-        if self.n_collected_frames == 0:
+        if len(self._drawn) == 0:
             return 0.0
         if self.collected_share is not None:
             return self.collected_share
+        # Uniform over the frames that begin a chunk: on both sides, an episode's dropped ones count for nothing.
         episodes = self.memory.dataset.meta.episodes
         lengths = torch.as_tensor(episodes["dataset_to_index"]) - torch.as_tensor(
             episodes["dataset_from_index"]
         )
-        demonstrated = int(lengths[sorted(self.seen_episodes)].sum())
-        return self.n_collected_frames / (demonstrated + self.n_collected_frames)
+        demonstrated = int((lengths[sorted(self.seen_episodes)] - self._n_dropped).clamp(min=0).sum())
+        return len(self._drawn) / (demonstrated + len(self._drawn))
 
     def training_rows(self, batch: Batch, generator: torch.Generator) -> Batch:
         """Rows of T for a training step: the loader's frames, a share exchanged for collected ones."""
@@ -115,29 +134,39 @@ class Replay:
         exchanged = torch.rand(len(rows), generator=generator) < self.share()
         n_exchanged = int(exchanged.sum())
         if n_exchanged:
-            draws = torch.randint(self.n_collected_frames, (n_exchanged,), generator=generator)
-            rows[exchanged.to(rows.device)] = (self.n_demonstration_frames + draws).to(rows)
-        return self._gather(batch, rows)
+            drawn = self._drawn[torch.randint(len(self._drawn), (n_exchanged,), generator=generator)]
+            rows[exchanged.to(rows.device)] = (self.n_demonstration_frames + drawn).to(rows)
+        return self._gather(batch, rows, augment=True)
 
     def demonstration_rows(self, batch: Batch) -> Batch:
         """The loader's frames with their chunks, for a held-out loss."""
         return self._gather(batch, batch["index"])
 
-    def _gather(self, batch: Batch, rows: Tensor) -> Batch:
+    def _gather(self, batch: Batch, rows: Tensor, augment: bool = False) -> Batch:
         gathered = gather_rows(self.table, rows, self.config, self._action_offsets, self._n_obs_steps)
-        images = {key: self._images(batch, rows, key) for key in self._cameras}
+        images = {key: self._images(batch, rows, key, augment) for key in self._cameras}
         return {**images, **gathered, ROW: rows}
 
-    def _images(self, batch: Batch, rows: Tensor, key: str) -> Tensor:
+    def _images(self, batch: Batch, rows: Tensor, key: str, augment: bool) -> Tensor:
         """A camera's normalised frames at `rows`; those that the loader did not deliver are read from disk."""
         normalise = self.memory.normaliser.normalise
         if self._n_obs_steps is not None:
-            return normalise(key, self.history(rows, [key], self._n_obs_steps)[key]).to(batch[key])
+            images = self.history(rows, [key], self._n_obs_steps)[key]
+            if augment:
+                images = torch.stack([self._augmented(key, history) for history in images])
+            return normalise(key, images).to(batch[key])
         exchanged = (rows != batch["index"]).nonzero()[:, 0].tolist()
         images = batch[key].clone() if exchanged else batch[key]
         for position in exchanged:
-            images[position] = normalise(key, self.image(int(rows[position]), key)).to(images)
+            image = self._augmented(key, self.image(int(rows[position]), key))
+            images[position] = normalise(key, image).to(images)
         return images
+
+    def _augmented(self, key: str, image: Tensor) -> Tensor:
+        """A camera's frame or history (..., C, H, W) as the loader delivers it in training: one draw for all of it."""
+        if self.image_transforms is None or key in self.memory.dataset.meta.depth_keys:
+            return image
+        return self.image_transforms(image)
 
     # ---- single frames ----
 

@@ -18,7 +18,7 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,8 +34,8 @@ MANIFEST = "manifest.json"
 REPORT = "round.json"
 MERGED = "merged"
 
-WriteDataset = Callable[[Path, Sequence[Episode]], None]
-"""Writes kept episodes as a finalised LeRobotDataset into a new folder."""
+WriteDataset = Callable[[Path, Iterator[Episode]], None]
+"""Writes kept episodes, of which there is at least one, as a finalised LeRobotDataset into a new folder."""
 
 
 @dataclass(frozen=True)
@@ -67,10 +67,12 @@ class Spool:
             os.fsync(log.fileno())
         self.records[record.number] = record
 
-    def kept(self) -> list[Episode]:
-        """The kept episodes in the order of their numbers."""
-        kept = [self.records[number] for number in sorted(self.records) if self.records[number].kept]
-        return [Episode.load(self._path(record), record) for record in kept]
+    def kept(self) -> Iterator[Episode]:
+        """The kept episodes in the order of their numbers, read one at a time: with cameras they are large."""
+        for number in sorted(self.records):
+            record = self.records[number]
+            if record.kept:
+                yield Episode.load(self._path(record), record)
 
     def _path(self, record: EpisodeRecord) -> Path:
         return self.arrays / f"episode-{record.number:06d}.npz"
@@ -148,11 +150,10 @@ class ReplayStore:
     def write_share(self, number: int, rank: int, write: WriteDataset) -> None:
         """Turn this process's spooled episodes into a dataset inside the unfinished round."""
         spool = self.spool(number, rank)
-        episodes = spool.kept()
         dataset = self._partial(number) / f"rank-{rank}"
         shutil.rmtree(dataset, ignore_errors=True)
-        if episodes:
-            write(dataset, episodes)
+        if any(record.kept for record in spool.records.values()):
+            write(dataset, spool.kept())
 
     def records(self, number: int, n_ranks: int) -> list[EpisodeRecord]:
         """Records of an unfinished round, of all processes."""

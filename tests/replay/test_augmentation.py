@@ -1,0 +1,153 @@
+"""`--dataset.image_transforms.*` on the images that T reads itself."""
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.transforms import ImageTransforms
+
+from lerobot_agpd.replay.episode import Episode, Ticket
+from lerobot_agpd.replay.memory import FrameMemory
+from lerobot_agpd.replay.replay import ROW, Replay
+from lerobot_agpd.replay.writer import EpisodeWriter
+from lerobot_agpd.run import this_run
+
+IMAGE, STATE = "observation.image", "observation.state"
+SHAPE = (3, 4, 6)
+FEATURES = {
+    IMAGE: {"dtype": "image", "shape": (4, 6, 3), "names": ["height", "width", "channels"]},
+    STATE: {"dtype": "float32", "shape": (1,), "names": None},
+    "action": {"dtype": "float32", "shape": (1,), "names": None},
+}
+DEMONSTRATED, COLLECTED = (0, 1, 2, 3), (200, 201)  # the value of every pixel, and the state
+
+
+def pixels(values) -> np.ndarray:
+    return np.stack([np.full((4, 6, 3), value, dtype=np.uint8) for value in values])
+
+
+def column(values) -> np.ndarray:
+    return np.array(values, dtype=np.float32)[:, None]
+
+
+@pytest.fixture(scope="module")
+def demonstrations(tmp_path_factory) -> LeRobotDataset:
+    root = tmp_path_factory.mktemp("data") / "images"
+    dataset = LeRobotDataset.create("local/images", fps=10, features=FEATURES, root=root, use_videos=False)
+    for value, image in zip(DEMONSTRATED, pixels(DEMONSTRATED), strict=True):
+        vector = np.array([value], dtype=np.float32)
+        dataset.add_frame({IMAGE: image, STATE: vector, "action": vector, "task": "look"})
+    dataset.save_episode()
+    dataset.finalize()
+    return LeRobotDataset("local/images", root=root)
+
+
+@pytest.fixture(scope="module")
+def collected(demonstrations, tmp_path_factory):
+    root = tmp_path_factory.mktemp("rounds") / "round-000" / "rank-0"
+    observations = {IMAGE: pixels(COLLECTED), STATE: column(COLLECTED)}
+    rewards = np.zeros(len(COLLECTED), dtype=np.float32)
+    ticket = Ticket(0, 0, 0.0)
+    episode = Episode(ticket, "look", observations, column(COLLECTED), rewards, None, 0.0, 0.0)
+    EpisodeWriter(demonstrations.meta).write(root, [episode], 0, "guided")
+    return root
+
+
+class Negative:
+    """A transform that is easily recognised; notes the shapes it is given."""
+
+    def __init__(self):
+        self.shapes = []
+
+    def __call__(self, image):
+        self.shapes.append(tuple(image.shape))
+        return 1 - image
+
+
+@pytest.fixture
+def make_replay(demonstrations, collected):
+    """T without normalisation and the loader's batch of all demonstrations, delivered as pixel value 0.25."""
+
+    def build(make_config, transform, **options):
+        config = make_config(
+            input_features={
+                IMAGE: PolicyFeature(FeatureType.VISUAL, SHAPE),
+                STATE: PolicyFeature(FeatureType.STATE, (1,)),
+            },
+            output_features={"action": PolicyFeature(FeatureType.ACTION, (1,))},
+            normalization_mapping=dict.fromkeys(("VISUAL", "STATE", "ACTION"), NormalizationMode.IDENTITY),
+            **options,
+        )
+        replay = Replay(FrameMemory(config, demonstrations.meta, {}), config, 0.5, transform)
+        batch = {
+            "index": torch.arange(4).repeat(8),
+            "episode_index": torch.zeros(32, dtype=torch.long),
+            IMAGE: torch.full((32, *SHAPE), 0.25),
+            STATE: torch.arange(4.0).repeat(8)[:, None],
+            "action": torch.arange(4.0).repeat(8)[:, None],
+        }
+        replay.observe(batch)
+        replay.add_dataset(collected)
+        return replay, batch
+
+    return build
+
+
+def generator():
+    return torch.Generator().manual_seed(0)
+
+
+def values(images):
+    """The pixel value of images (..., C, H, W) that have only one."""
+    flat = images.flatten(-3)
+    assert torch.equal(flat.min(-1).values, flat.max(-1).values)
+    return (flat[..., 0] * 255).round().long()
+
+
+def test_collected_frames_are_transformed_and_the_loaders_are_left_alone(make_replay, agpd_config):
+    transform = Negative()
+    replay, batch = make_replay(agpd_config, transform)
+    rows = replay.training_rows(batch, generator())
+    exchanged = rows[ROW] >= len(DEMONSTRATED)
+    assert 0 < exchanged.sum() < 32
+    assert torch.equal(rows[IMAGE][~exchanged], batch[IMAGE][~exchanged])
+    assert torch.equal(values(rows[IMAGE][exchanged]), 255 - rows[STATE][exchanged, 0].long())
+    assert transform.shapes == [SHAPE] * int(exchanged.sum())
+
+
+def test_a_history_is_transformed_as_one(make_replay, agpd_diffusion_config):
+    transform = Negative()
+    replay, batch = make_replay(agpd_diffusion_config, transform, drop_n_last_frames=0)
+    rows = replay.training_rows(batch, generator())
+    assert (rows[ROW] >= len(DEMONSTRATED)).any() and (rows[ROW] < len(DEMONSTRATED)).any()
+    assert rows[IMAGE].shape == (32, 2, *SHAPE)
+    assert torch.equal(values(rows[IMAGE]), 255 - rows[STATE][..., 0].long())
+    assert transform.shapes == [(2, *SHAPE)] * 32, "one draw for a history, as in LeRobot's loader"
+
+
+def test_held_out_rows_and_the_teachers_histories_are_not_transformed(make_replay, agpd_diffusion_config):
+    replay, batch = make_replay(agpd_diffusion_config, Negative())
+    rows = replay.demonstration_rows(batch)
+    assert torch.equal(values(rows[IMAGE]), rows[STATE][..., 0].long())
+    history = replay.history(torch.tensor([2, 5]), [IMAGE], 2)[IMAGE]
+    assert values(history).tolist() == [[1, 2], [200, 201]]
+
+
+def test_the_runs_transforms_are_found(monkeypatch, tmp_path):
+    def transforms(*flags):
+        monkeypatch.setattr(sys, "argv", ["lerobot-train", *flags])
+        return this_run().image_transforms
+
+    file = tmp_path / "run.yaml"
+    file.write_text("dataset: {repo_id: a/b, image_transforms: {enable: true, max_num_transforms: 2}}")
+    assert transforms() is None and transforms("--dataset.image_transforms.max_num_transforms=1") is None
+    found = transforms(
+        "--dataset.image_transforms.enable=true", "--dataset.image_transforms.max_num_transforms=1"
+    )
+    assert isinstance(found, ImageTransforms) and found.tf.n_subset == 1
+    assert found(torch.rand(2, *SHAPE)).shape == (2, *SHAPE)
+    assert transforms(f"--config_path={file}").tf.n_subset == 2
+    assert transforms(f"--config_path={file}", "--dataset.image_transforms.enable=false") is None
