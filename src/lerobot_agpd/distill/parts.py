@@ -18,7 +18,7 @@ from lerobot_agpd.distill.state import DistillationState, replay_root
 from lerobot_agpd.guidance.config import require
 from lerobot_agpd.guidance.loading import check_teacher_fits, load_teacher
 from lerobot_agpd.guidance.teacher import Teacher
-from lerobot_agpd.replay.memory import FrameTable
+from lerobot_agpd.replay.frames import FrameTable
 from lerobot_agpd.replay.replay import Replay
 from lerobot_agpd.replay.store import ReplayStore
 from lerobot_agpd.run import RunInfo, process_rank, world_size
