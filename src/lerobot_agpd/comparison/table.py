@@ -1,4 +1,4 @@
-"""The comparison in words. Per task: results of the methods, paired differences, costs, what the rounds did."""
+"""The comparison in words: the methods; per task what they reached, how they differ, what they took and collected."""
 
 from __future__ import annotations
 
@@ -47,11 +47,10 @@ Episodes and times are means per training seed; times were taken on a machine th
 
 def report(matrix: Matrix, results: Mapping[str, Methods], missing: Sequence[str], pictures: str = "") -> str:
     """The whole report in markdown; its pictures (`write_pictures`) lie in `pictures`, e.g. `../figures/`."""
-    parts = []
+    parts = _methods(matrix, results)
     for task, methods in results.items():
         parts.append(f"## {matrix.tasks[task].title or task}")
         parts += _task(matrix, task, methods, pictures)
-    parts += _methods(matrix, results)
     parts += _notes(matrix, results)
     parts += _remarks(results, missing)
     return "\n\n".join(parts) + "\n"
