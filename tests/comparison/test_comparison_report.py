@@ -214,8 +214,10 @@ def test_results_are_those_of_the_whole_matrix(compared):
 
 def test_the_report_says_what_is_missing_and_what_was_disturbed(compared):
     matrix, results = compared
-    text = report(matrix, {"pusht": results}, ["pusht/dagger/seed-1", "pusht/dagger/seed-2"])
-    assert "## pusht" in text and "Not finished: pusht/dagger (seed-1, seed-2)" in text
+    text = report(matrix, {"pusht": results}, ["pusht/dagger/seed-1", "pusht/pd/seed-1", "pusht/pd/seed-2"])
+    assert (
+        "## pusht" in text and "Not finished: seed-1 of pusht/dagger; seed-1, seed-2 of pusht/pd.**" in text
+    )
     assert "`agpd`: the whole method" in text and "pusht/agpd/seed-2 (1)" in text
     assert "same packages" not in text
     assert "| agpd | +0.50 [" in text and "4 other environments (seeds from 100000)" in text

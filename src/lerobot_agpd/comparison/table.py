@@ -34,7 +34,7 @@ success but for a constant is left out.
 Compare methods by the paired differences: row minus column, over the training seeds that both have (the raised number says
 how many) and the same environments, with a 95 % t interval for training seeds and environments as crossed random factors
 (Satterthwaite's degrees of freedom). Bold: two or more seeds, and the interval excludes zero. With one seed the
-interval covers environments only; two trainings of one and the same method differ by more. With three the factor is
+interval covers environments only; two trainings of one and the same method can differ by more. With three the factor is
 up to 4.3, so small differences are not told apart. Nothing is adjusted for the number of comparisons.
 
 Pictures: a thick bar spans a method's training seeds (small dots), a thin one is the interval over the episodes of a
@@ -118,17 +118,20 @@ def _remarks(results: Mapping[str, Methods], missing: Sequence[str]) -> list[str
         kinds = sorted(", ".join(sorted(kind - common)) for kind in packages)
         remarks.append(f"- **Not all was made with the same packages: {'; '.join(kinds)}.**")
     if missing:
-        remarks.append(f"- **Not finished: {_by_method(missing)}.**")
+        remarks.append(f"- **Not finished: {_by_seeds(missing)}.**")
     return ["\n".join(remarks)] if remarks else []
 
 
-def _by_method(runs: Sequence[str]) -> str:
-    """`pusht/bc (seed-1, seed-2); pusht/agpd (seed-2)`."""
+def _by_seeds(runs: Sequence[str]) -> str:
+    """E.g. `seed-1, seed-2 of pusht/bc, pusht/pd; seed-2 of pusht/agpd`."""
     seeds: dict[str, list[str]] = {}
     for name in runs:
         method, _, seed = name.rpartition("/")
         seeds.setdefault(method, []).append(seed)
-    return "; ".join(f"{method} ({', '.join(which)})" for method, which in seeds.items())
+    methods: dict[str, list[str]] = {}
+    for method, which in seeds.items():
+        methods.setdefault(", ".join(which), []).append(method)
+    return "; ".join(f"{which} of {', '.join(names)}" for which, names in methods.items())
 
 
 def results_table(
