@@ -28,7 +28,6 @@ SUMMARY = {
     "pd": "PD",
     "dagger": "DAgger",
     "agpd": "AGPD",
-    "bc_long": "cloning, 3x steps",
     "pd_long": "PD, 3x steps",
     "agpd_long": "AGPD, 3x steps",
     "teacher": "teacher",

@@ -46,7 +46,7 @@ def test_expansion_layers_flags_and_names_folders(tmp_path):
     assert bc.flags["policy.collect.every"] == 0 and agpd.flags["policy.collect.every"] == 7
     assert "policy.teacher.path" not in bc.flags
     assert agpd.flags["policy.teacher.path"] == teacher.policy == str(tmp_path / "teacher")
-    assert teacher.seed is None and not teacher.flags
+    assert teacher.seed is None and teacher.flags["policy.path"] == teacher.policy
     words = bc.words
     assert (
         "--dataset.episodes=[0, 1]" in words and "--policy.push_to_hub=false" in words and "--seed=1" in words

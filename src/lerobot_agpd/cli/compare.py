@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import draccus
-from lerobot.utils.import_utils import register_third_party_plugins
-from lerobot.utils.utils import init_logging
 from rich.console import Console
 from rich.markdown import Markdown
 
+from lerobot_agpd.cli.command import command
 from lerobot_agpd.comparison.evaluations import digest, evaluate_run
 from lerobot_agpd.comparison.files import write_text
 from lerobot_agpd.comparison.jobs import Job, Step, run_jobs
@@ -197,12 +196,8 @@ def run(config: CompareConfig) -> None:
 
 def main() -> None:
     """Console entry point."""
-    init_logging()
-    register_third_party_plugins()
-    try:
+    with command("lerobot-agpd-compare"):
         run()
-    except (ValueError, FileNotFoundError) as error:
-        sys.exit(f"lerobot-agpd-compare: {error}")
 
 
 if __name__ == "__main__":

@@ -21,10 +21,9 @@ from lerobot.configs import FeatureType
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import DONE, REWARD, SUCCESS
-from lerobot.utils.import_utils import register_third_party_plugins
-from lerobot.utils.utils import init_logging
 from rich.console import Console
 
+from lerobot_agpd.cli.command import command
 from lerobot_agpd.cli.progress import episode_bar
 from lerobot_agpd.collect.config import EVALUATION_SEEDS
 from lerobot_agpd.envs.base import SingleEnvConfig
@@ -199,10 +198,9 @@ def run(config: DemosConfig) -> None:
 
 def main() -> None:
     """Console entry point."""
-    init_logging()
-    register_third_party_plugins()
     disable_progress_bars()  # one bar of the datasets library per episode would tear ours apart
-    run()
+    with command("lerobot-agpd-demos"):
+        run()
 
 
 if __name__ == "__main__":

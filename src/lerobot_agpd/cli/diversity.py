@@ -10,12 +10,11 @@ import draccus
 import torch
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs import EnvConfig
-from lerobot.utils.import_utils import register_third_party_plugins
-from lerobot.utils.utils import init_logging
 from rich.console import Console
 from rich.table import Table
 
 from lerobot_agpd.analysis.frontier import plot_frontier, plot_trajectories
+from lerobot_agpd.cli.command import command
 from lerobot_agpd.collect.config import EVALUATION_SEEDS
 from lerobot_agpd.collect.deciders.pair import PairDecider
 from lerobot_agpd.collect.strategies import make_strategy
@@ -152,9 +151,8 @@ def run(config: DiversityConfig) -> None:
 
 def main() -> None:
     """Console entry point."""
-    init_logging()
-    register_third_party_plugins()
-    run()
+    with command("lerobot-agpd-diversity"):
+        run()
 
 
 if __name__ == "__main__":

@@ -12,11 +12,11 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
-from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import seeded_context
-from lerobot.utils.utils import init_logging
 
 from lerobot_agpd.analysis.latency import random_observations
+from lerobot_agpd.cli.command import command
+from lerobot_agpd.guidance.loading import read_policy_config
 from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
     DiffusionTransformerConfig,
@@ -96,10 +96,11 @@ def export(config: ExportConfig) -> PreTrainedPolicy:
     """Write the plain checkpoint with its processors.
 
     Raises:
+        FileNotFoundError: if there is no checkpoint.
         ValueError: if LeRobot has no policy with the checkpoint's network.
         RuntimeError: if the exported policy acts differently.
     """
-    policy_config: Any = PreTrainedConfig.from_pretrained(config.checkpoint)
+    policy_config: Any = read_policy_config(config.checkpoint, "--checkpoint")
     if hasattr(policy_config, "pretrained_backbone_weights"):
         policy_config.pretrained_backbone_weights = None
     policy = get_policy_class(policy_config.type).from_pretrained(config.checkpoint, config=policy_config)
@@ -128,9 +129,8 @@ def run(config: ExportConfig) -> None:
 
 def main() -> None:
     """Console entry point."""
-    init_logging()
-    register_third_party_plugins()
-    run()
+    with command("lerobot-agpd-export"):
+        run()
 
 
 if __name__ == "__main__":

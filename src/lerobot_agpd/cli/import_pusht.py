@@ -17,8 +17,9 @@ import draccus
 import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, DONE, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE, REWARD, SUCCESS
-from lerobot.utils.utils import init_logging
 from rich.progress import track
+
+from lerobot_agpd.cli.command import command
 
 logger = logging.getLogger(__name__)
 
@@ -258,8 +259,8 @@ def run(config: ImportPushTConfig) -> None:
 
 def main() -> None:
     """Console entry point."""
-    init_logging()
-    run()
+    with command("lerobot-agpd-import-pusht"):
+        run()
 
 
 if __name__ == "__main__":

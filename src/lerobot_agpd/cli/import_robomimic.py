@@ -15,8 +15,8 @@ from typing import Any
 import draccus
 from datasets import disable_progress_bars
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.utils.utils import init_logging
 
+from lerobot_agpd.cli.command import command
 from lerobot_agpd.cli.progress import episode_bar
 from lerobot_agpd.envs.robomimic_columns import RobomimicColumns, cameras_of, task_of
 from lerobot_agpd.envs.robomimic_hdf5 import RobomimicFile, sha256
@@ -183,9 +183,9 @@ def with_source_flag(arguments: Sequence[str]) -> list[str]:
 
 def main() -> None:
     """Console entry point."""
-    init_logging()
     disable_progress_bars()  # one bar of the datasets library per episode would tear ours apart
-    run(draccus.parse(ImportRobomimicConfig, args=with_source_flag(sys.argv[1:])))
+    with command("lerobot-agpd-import-robomimic"):
+        run(draccus.parse(ImportRobomimicConfig, args=with_source_flag(sys.argv[1:])))
 
 
 if __name__ == "__main__":

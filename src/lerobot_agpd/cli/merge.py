@@ -1,13 +1,12 @@
 """`lerobot-agpd-merge`: the episodes that a run has collected as one LeRobotDataset, and to the Hub."""
 
 import logging
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import draccus
-from lerobot.utils.utils import init_logging
 
+from lerobot_agpd.cli.command import command
 from lerobot_agpd.guidance.config import require
 from lerobot_agpd.replay.store import ReplayStore
 
@@ -41,11 +40,8 @@ def run(config: MergeConfig) -> None:
 
 def main() -> None:
     """Console entry point."""
-    init_logging()
-    try:
+    with command("lerobot-agpd-merge"):
         run()
-    except ValueError as error:
-        sys.exit(f"lerobot-agpd-merge: {error}")
 
 
 if __name__ == "__main__":

@@ -2,15 +2,12 @@
 
 import json
 import logging
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import draccus
 from lerobot.envs import EnvConfig
-from lerobot.utils.import_utils import register_third_party_plugins
-from lerobot.utils.utils import init_logging
 from rich.console import Console
 from rich.table import Table
 
@@ -22,6 +19,7 @@ from lerobot_agpd.analysis.evaluation import (
 )
 from lerobot_agpd.analysis.report import HEADER, MethodResult, markdown, plot_curves, table_rows
 from lerobot_agpd.analysis.statistics import success_rate
+from lerobot_agpd.cli.command import command
 from lerobot_agpd.collect.config import EVALUATION_SEEDS
 from lerobot_agpd.guidance.config import require
 from lerobot_agpd.replay.store import ReplayStore
@@ -160,12 +158,8 @@ def run(config: ReportConfig) -> None:
 
 def main() -> None:
     """Console entry point."""
-    init_logging()
-    register_third_party_plugins()
-    try:
+    with command("lerobot-agpd-report"):
         run()
-    except (ValueError, FileNotFoundError) as error:
-        sys.exit(f"lerobot-agpd-report: {error}")
 
 
 if __name__ == "__main__":

@@ -14,14 +14,13 @@ import rerun as rr
 import torch
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors
-from lerobot.utils.import_utils import register_third_party_plugins
-from lerobot.utils.utils import init_logging
 from rich.console import Console
 from rich.table import Table
 
 from lerobot_agpd.analysis.recording import Array, RolloutRecord
 from lerobot_agpd.analysis.rerun_log import blueprint, layout, log_rollout
 from lerobot_agpd.analysis.still import draw_still
+from lerobot_agpd.cli.command import command
 from lerobot_agpd.collect.config import EVALUATION_SEEDS
 from lerobot_agpd.collect.deciders.teacher import GuidedTeacher
 from lerobot_agpd.collect.recorders import DecisionRecorder, FrameRecorder
@@ -209,9 +208,8 @@ def run(config: VizConfig) -> None:
 
 def main() -> None:
     """Console entry point."""
-    init_logging()
-    register_third_party_plugins()
-    run()
+    with command("lerobot-agpd-viz"):
+        run()
 
 
 if __name__ == "__main__":

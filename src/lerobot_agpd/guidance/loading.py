@@ -12,6 +12,21 @@ from lerobot_agpd.guidance.config import GuidanceConfig, TeacherConfig
 from lerobot_agpd.guidance.teacher import Features, Teacher
 
 
+def read_policy_config(path: str, flag: str) -> PreTrainedConfig:
+    """Configuration of the checkpoint that a flag names.
+
+    Raises:
+        FileNotFoundError: if there is no policy at the path.
+    """
+    try:
+        return PreTrainedConfig.from_pretrained(path)
+    except Exception as error:
+        raise FileNotFoundError(
+            f"{flag}='{path}' is neither a folder with a policy's config.json nor a Hub repository that can be "
+            f"reached ({error})"
+        ) from error
+
+
 def load_teacher(config: TeacherConfig, device: str) -> Teacher:
     """Load the teacher that `--policy.teacher.path` names, frozen.
 
@@ -25,13 +40,7 @@ def load_teacher(config: TeacherConfig, device: str) -> Teacher:
             "repository of a LeRobot policy. To clone the demonstrations alone, pass --policy.collect.every=0 "
             "--policy.adversary.weight=0"
         )
-    try:
-        policy_config = PreTrainedConfig.from_pretrained(config.path)
-    except Exception as error:
-        raise FileNotFoundError(
-            f"--policy.teacher.path='{config.path}' is neither a folder with a policy's config.json nor a Hub "
-            f"repository that can be reached ({error})"
-        ) from error
+    policy_config = read_policy_config(config.path, "--policy.teacher.path")
     policy_config.device = device
     policy_config.pretrained_path = Path(config.path)
     policy = get_policy_class(policy_config.type).from_pretrained(config.path, config=policy_config)
