@@ -195,6 +195,6 @@ def test_a_killed_comparison_goes_on_where_it_was(tmp_path):
     assert result["seconds"]["total"] > result["seconds"]["environment"] > 0
     assert result["evaluated_with"]["versions"]["lerobot"]
     text = (tmp_path / "comparison" / "report.md").read_text()
-    assert "| agpd | 30 |" in text and "| teacher | - |" in text and "Paired differences" in text
+    assert "| agpd | 1 of 1 | 30 |" in text and "| teacher | - | - |" in text and "Paired differences" in text
     assert (tmp_path / "comparison" / "curves-pick.png").exists()
     assert (tmp_path / "comparison" / "outcomes-pick.png").exists()
