@@ -4,7 +4,9 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
+import draccus
 import pytest
+from lerobot.configs import PreTrainedConfig
 from matrices import changed, content, evaluation, load
 
 from lerobot_agpd.analysis.evaluation import Evaluation
@@ -126,6 +128,20 @@ PARSED: set[str] = set()
 """Methods' flags that a matrix has shown to exist: parsing takes seconds, and matrices share most methods."""
 
 
+def changed_defaults(matrix: str, run, config):
+    """Options of the policy with which a committed run was made, and what its flags mean today, where they differ."""
+    results = ROOT / "benchmarks" / "comparison" / "results" / matrix
+    made = results / run.task / run.method / f"seed-{run.seed}" / "run.json"
+    if not made.is_file():
+        return
+    then = flat(json.loads(made.read_text())["config"]["policy"])
+    now = flat(draccus.encode(config.policy, PreTrainedConfig))
+    of_its_own = ("path", "root", "input_features", "output_features", "env", "device", "pretrained_path")
+    for name in then.keys() & now.keys():
+        if not set(name.split(".")) & set(of_its_own) and then[name] != now[name]:
+            yield name, (then[name], now[name])
+
+
 @pytest.mark.parametrize(
     "path", sorted((ROOT / "benchmarks" / "comparison").glob("*.yaml")), ids=lambda p: p.stem
 )
@@ -141,7 +157,11 @@ def test_the_flags_of_committed_matrices_exist(path, monkeypatch, tmp_path):
         flags = str(matrix.methods[run.method].flags)
         if not run.policy and (run in every_task or flags not in PARSED):
             PARSED.add(flags)
-            parse_flags(run.words)
+            config = parse_flags(run.words)
+            changed = dict(changed_defaults(path.stem, run, config))
+            assert not changed, (
+                f"{run.name} was made with other defaults: pin them in {path.name}, or run it again"
+            )
 
 
 # ---- what a folder says ----

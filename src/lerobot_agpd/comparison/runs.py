@@ -168,8 +168,11 @@ def _missing(run: Run) -> list[str]:
     return missing
 
 
-def parse_flags(words: Sequence[str]) -> None:
+def parse_flags(words: Sequence[str]) -> TrainPipelineConfig:
     """Parse flags with LeRobot's own configuration.
+
+    Returns:
+        What lerobot-train makes of them, defaults included.
 
     Raises:
         ValueError: for a flag or value that it refuses, or one that a comparison cannot have.
@@ -180,7 +183,9 @@ def parse_flags(words: Sequence[str]) -> None:
     logging.disable(logging.WARNING)  # what LeRobot warns of while parsing, the run says again
     try:
         with redirect_stderr(printed):
-            config = draccus.parse(TrainPipelineConfig, config_path=config_path, args=words)
+            config: TrainPipelineConfig = draccus.parse(
+                TrainPipelineConfig, config_path=config_path, args=words
+            )
     except SystemExit as error:
         raise ValueError(printed.getvalue().rpartition("error: ")[2].strip()) from error
     except (ParsingError, OSError) as error:
@@ -192,3 +197,4 @@ def parse_flags(words: Sequence[str]) -> None:
         "policy.push_to_hub is on: a comparison does not upload its runs; set it to false in common",
     )
     require(config.save_checkpoint, "save_checkpoint is off: a run without checkpoints cannot be evaluated")
+    return config
