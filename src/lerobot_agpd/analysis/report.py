@@ -126,5 +126,5 @@ def _plot_rounds(axis: Any, rounds: Sequence[Mapping[str, Any]]) -> None:
     if rounds:
         scale = axis.twinx()
         scale.plot([entry["round"] for entry in rounds], [entry["scale"] for entry in rounds], "k:", lw=1)
-        scale.set(ylabel="guidance scale (dotted)", yscale="symlog")
+        scale.set(ylabel="guidance scale (dotted)", ylim=(0, None))
         axis.legend(loc="lower right", fontsize=8)
