@@ -204,7 +204,8 @@ def test_a_failed_upload_does_not_end_the_training(tmp_path, demonstrations, cap
     rounds.runner.finish(0, rounds.runner.report(0, SCALE, records, seconds))
     rounds.runner.merge()  # offline, or without a token
     assert "could not be merged or uploaded" in caplog.text
-    assert f"lerobot-agpd-merge --root={tmp_path}" in caplog.text
+    again = f"lerobot-agpd-merge --root={tmp_path} --repo_id=nobody/nothing --push_to_hub=true"
+    assert again in caplog.text
     assert len(rounds.store.rounds()) == 1
 
 

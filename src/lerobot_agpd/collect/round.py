@@ -230,9 +230,11 @@ class RoundRunner:
             if merged is not None and self.config.push_to_hub:
                 merged.push_to_hub()
         except Exception:
+            upload = f" --repo_id={self.config.repo_id} --push_to_hub=true" if self.config.push_to_hub else ""
             logger.exception(
                 "the collected episodes could not be merged or uploaded; the rounds are complete in %s. Once the "
-                "cause is gone, run lerobot-agpd-merge --root=%s",
+                "cause is gone, run lerobot-agpd-merge --root=%s%s",
                 self.store.root,
                 self.store.root,
+                upload,
             )
