@@ -7,12 +7,14 @@ from pathlib import Path
 import draccus
 import pytest
 from lerobot.configs import PreTrainedConfig
+from lerobot.datasets.utils import STATS_PATH
 from matrices import changed, content, evaluation, load
 
 from lerobot_agpd.analysis.evaluation import Evaluation
 from lerobot_agpd.comparison.evaluations import best_step, read_evaluation
 from lerobot_agpd.comparison.files import read_json, write_json
 from lerobot_agpd.comparison.matrix import flat, load_matrix
+from lerobot_agpd.comparison.provenance import WEIGHTS, digest
 from lerobot_agpd.comparison.runs import check, environment, expand, parse_flags
 from lerobot_agpd.comparison.training import (
     StartLog,
@@ -225,6 +227,26 @@ def test_other_flags_are_refused(one_run, tmp_path):
     other = load(tmp_path, changed(content(tmp_path), "methods.agpd.flags", {"batch_size": 3}))
     with pytest.raises(ValueError, match="started with other flags .batch_size: - -> 3"):
         check_same_command(expand(other, methods=["agpd"], seeds=[1])[0])
+
+
+def test_a_run_is_not_resumed_with_another_teacher_or_other_demonstrations(one_run, tmp_path):
+    teacher, statistics = tmp_path / "teacher" / WEIGHTS, tmp_path / "demos" / STATS_PATH
+    statistics.parent.mkdir()
+    for file in (teacher, statistics):
+        file.write_text("one")
+    prepare(one_run)
+    StartLog(one_run).begin(one_run, ["lerobot-train"], threads=1)
+    known = read_starts(one_run)[0]["inputs"]
+    assert known == {"teacher": digest(tmp_path / "teacher"), "demonstrations": digest(tmp_path / "teacher")}
+    check_same_command(one_run)
+    for file, kind in ((teacher, "teacher"), (statistics, "demonstrations")):
+        file.write_text("another")
+        with pytest.raises(ValueError, match=rf"other files than now lie at its paths \({kind}\)"):
+            check_same_command(one_run)
+        file.write_text("one")
+    teacher.write_text("another")
+    checkpoint(one_run, 20, 20)
+    check_same_command(one_run)  # finished: what it was made with is no longer needed
 
 
 def test_starts_are_remembered_with_their_time_and_early_rounds(one_run):

@@ -12,10 +12,11 @@ from lerobot_agpd.analysis.latency import Latency
 from lerobot_agpd.analysis.statistics import success_rate
 from lerobot_agpd.cli.compare import CompareConfig, _readable, needs_work
 from lerobot_agpd.comparison.curves import draw_curves, mean_curve
-from lerobot_agpd.comparison.evaluations import RESULT, digest
+from lerobot_agpd.comparison.evaluations import RESULT
 from lerobot_agpd.comparison.files import write_json
 from lerobot_agpd.comparison.outcomes import pooled
 from lerobot_agpd.comparison.pictures import write_pictures
+from lerobot_agpd.comparison.provenance import digest
 from lerobot_agpd.comparison.results import compare, read_result, read_results
 from lerobot_agpd.comparison.rounds import HEADER, collection_rows
 from lerobot_agpd.comparison.runs import expand
@@ -230,6 +231,25 @@ def test_the_report_says_if_packages_changed_on_the_way(compared):
     results["bc"][0] = read_result(run, matrix)
     text = report(matrix, {"pusht": results}, [])
     assert "Not all was made with the same packages: torch 2; torch 3.**" in text
+
+
+def test_the_report_names_runs_that_another_teacher_taught(compared):
+    matrix, results = compared
+
+    def text(*fingerprints: str) -> str:
+        taught = [
+            replace(result, inputs={"teacher": name})
+            for result, name in zip(results["agpd"], fingerprints, strict=True)
+        ]
+        return report(matrix, {"pusht": {**results, "agpd": taught}}, [])
+
+    evaluated = results["teacher"][0].weights
+    assert "had the same" not in text(evaluated, evaluated)
+    remark = "Not all of pusht had the same teacher; those recorded, by fingerprint: "
+    assert f"{remark}{evaluated[:9]}: seed-1 of pusht/agpd; another: seed-2 of pusht/agpd.**" in text(
+        evaluated, "another"
+    )
+    assert f"{remark}another: seed-1, seed-2 of pusht/agpd.**" in text("another", "another")
 
 
 def test_differences_without_spread_are_not_shown_as_certain(compared):

@@ -12,11 +12,12 @@ from rich.console import Console
 from rich.markdown import Markdown
 
 from lerobot_agpd.cli.command import command
-from lerobot_agpd.comparison.evaluations import digest, evaluate_run
+from lerobot_agpd.comparison.evaluations import evaluate_run
 from lerobot_agpd.comparison.files import write_text
 from lerobot_agpd.comparison.jobs import Job, Step, run_jobs
 from lerobot_agpd.comparison.matrix import Matrix, load_matrix
 from lerobot_agpd.comparison.pictures import write_pictures
+from lerobot_agpd.comparison.provenance import digest
 from lerobot_agpd.comparison.results import RunResult, read_result, read_results
 from lerobot_agpd.comparison.runs import Run, check, expand
 from lerobot_agpd.comparison.table import report

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -18,7 +17,7 @@ from lerobot_agpd.analysis.evaluation import Checkpoint, Environments, Evaluatio
 from lerobot_agpd.analysis.statistics import success_rate
 from lerobot_agpd.comparison.files import read_json, write_json
 from lerobot_agpd.comparison.matrix import MEASURES, EvaluationEntry, Matrix
-from lerobot_agpd.comparison.provenance import provenance
+from lerobot_agpd.comparison.provenance import digest, provenance
 from lerobot_agpd.comparison.runs import Run, environment
 from lerobot_agpd.comparison.training import progress, read_starts, train_command
 
@@ -26,7 +25,6 @@ logger = logging.getLogger(__name__)
 
 EVALUATIONS = "evaluations"
 RESULT = "run.json"
-WEIGHTS = "model.safetensors"
 
 
 class Evaluator:
@@ -87,15 +85,6 @@ def read_evaluation(file: Path, request: Mapping[str, Any]) -> Evaluation | None
     wanted = list(range(request["seed"], request["seed"] + request["episodes"]))
     lengths = {len(evaluation.successes), len(evaluation.max_rewards)}
     return evaluation if evaluation.seeds == wanted and lengths == {len(wanted)} else None
-
-
-def digest(path: str | Path) -> str:
-    """SHA-256 of a checkpoint's weights; the name of a Hub repository."""
-    weights = Path(path) / WEIGHTS
-    if not weights.is_file():
-        return str(path)
-    with weights.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def best_step(curve: Mapping[int, Evaluation], measure: str) -> int:

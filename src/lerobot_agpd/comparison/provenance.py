@@ -1,16 +1,22 @@
-"""With what a number was made: packages, code, machine."""
+"""With what a number was made: packages, code, machine, the files it started from."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 import subprocess
+from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from lerobot.datasets.utils import STATS_PATH
+
 import lerobot_agpd
+
+WEIGHTS = "model.safetensors"
 
 PACKAGES = (
     "lerobot",
@@ -39,6 +45,37 @@ def provenance() -> dict[str, Any]:
             "cores": os.cpu_count(),
         },
     }
+
+
+def digest(path: str | Path) -> str:
+    """SHA-256 of a checkpoint's weights; the name of a Hub repository."""
+    return _sha256(Path(path) / WEIGHTS) or str(path)
+
+
+def inputs(flags: Mapping[str, Any]) -> dict[str, str]:
+    """Fingerprints of what a training starts from: the same command makes other teachers on other machines.
+
+    Args:
+        flags: dotted flags of lerobot-train.
+
+    Returns:
+        `teacher`, of its weights, if the run has one; `demonstrations`, of their statistics, if they are on this
+        machine.
+    """
+    found: dict[str, str] = {}
+    if teacher := flags.get("policy.teacher.path"):
+        found["teacher"] = digest(teacher)
+    root = flags.get("dataset.root")
+    if root and (statistics := _sha256(Path(root) / STATS_PATH)):
+        found["demonstrations"] = statistics
+    return found
+
+
+def _sha256(path: Path) -> str | None:
+    if not path.is_file():
+        return None
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _versions() -> dict[str, str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,7 @@ class RunResult:
         rounds_adopted: rounds that an interrupted run's student met earlier than an uninterrupted one's.
         commits: of this project's code, in training and evaluation.
         packages: versions of the others, one set of texts for each start.
+        inputs: fingerprints of what its training started from, by kind; empty for results older than the record.
         weights: digest of the weights of a policy that was only evaluated.
     """
 
@@ -50,6 +51,7 @@ class RunResult:
     rounds_adopted: int
     commits: frozenset[str]
     packages: frozenset[frozenset[str]]
+    inputs: Mapping[str, str] = field(default_factory=dict)
     weights: str | None = None
 
     def values(self, which: str, measure: str) -> list[Any]:
@@ -92,6 +94,7 @@ def read_result(run: Run, matrix: Matrix) -> RunResult | None:
             rounds_adopted=sum(start["rounds_adopted"] for start in content["starts"]),
             commits=frozenset(_commit(entry["git"]) for entry in software),
             packages=frozenset(_packages(entry["versions"]) for entry in software),
+            inputs=content["starts"][0].get("inputs", {}) if content["starts"] else {},
             weights=content.get("weights"),
         )
     except (KeyError, TypeError, AttributeError) as error:

@@ -117,9 +117,29 @@ def _remarks(results: Mapping[str, Methods], missing: Sequence[str]) -> list[str
         common = frozenset.intersection(*packages)
         kinds = sorted(", ".join(sorted(kind - common)) for kind in packages)
         remarks.append(f"- **Not all was made with the same packages: {'; '.join(kinds)}.**")
+    remarks += [remark for task, methods in results.items() for remark in _other_inputs(task, methods)]
     if missing:
         remarks.append(f"- **Not finished: {_by_seeds(missing)}.**")
     return ["\n".join(remarks)] if remarks else []
+
+
+def _other_inputs(task: str, methods: Methods) -> list[str]:
+    """Remarks on a task's runs that did not start from the same files: a teacher trained again is another teacher."""
+    runs = [result for entries in methods.values() for result in entries]
+    evaluated = {result.weights for result in runs if result.run.policy}
+    remarks = []
+    for kind in ("teacher", "demonstrations"):
+        by_file: dict[str, list[str]] = {}
+        for result in runs:
+            if fingerprint := result.inputs.get(kind):
+                by_file.setdefault(fingerprint, []).append(result.run.name)
+        known = by_file.keys() | (evaluated if kind == "teacher" else set())
+        if len(known) > 1:
+            groups = "; ".join(f"{file[:9]}: {_by_seeds(names)}" for file, names in sorted(by_file.items()))
+            remarks.append(
+                f"- **Not all of {task} had the same {kind}; those recorded, by fingerprint: {groups}.**"
+            )
+    return remarks
 
 
 def _by_seeds(runs: Sequence[str]) -> str:

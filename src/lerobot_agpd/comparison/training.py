@@ -2,7 +2,7 @@
 
 <output>/<task>/<method>/seed-<n>/
     command.json       flags the run was started with
-    starts.jsonl       every start: when, from which step, how long, with which packages
+    starts.jsonl       every start: when, from which step, how long, with which packages, teacher and demonstrations
     train/             output folder of lerobot-train
     agpd/              collected episodes, once a run without checkpoint had to start anew; else train/agpd
     train.log  evaluate.log
@@ -31,7 +31,7 @@ from lerobot.utils.constants import (
 )
 
 from lerobot_agpd.comparison.files import read_json, write_json, write_text
-from lerobot_agpd.comparison.provenance import provenance
+from lerobot_agpd.comparison.provenance import inputs, provenance
 from lerobot_agpd.comparison.runs import Run
 from lerobot_agpd.distill.state import REPLAY_FOLDER, STATE_FILE
 
@@ -94,10 +94,10 @@ def train_command(run: Run) -> list[str]:
 
 
 def check_same_command(run: Run) -> None:
-    """Refuse a run that was started with other flags.
+    """Refuse a run that was started with other flags, or is to be resumed with other files behind them.
 
     Raises:
-        ValueError: naming the flags that differ.
+        ValueError: naming what differs.
     """
     path = run.folder / COMMAND
     if run.policy or not path.is_file():
@@ -111,6 +111,22 @@ def check_same_command(run: Run) -> None:
         raise ValueError(
             f"{run.folder} was started with other flags ({'; '.join(changes)}); restore them, choose another "
             "--output, or remove the folder to train anew"
+        )
+    reached = progress(run)
+    if not (reached is not None and reached.finished):
+        _check_same_inputs(run)
+
+
+def _check_same_inputs(run: Run) -> None:
+    starts = read_starts(run)
+    known = starts[-1].get("inputs", {}) if starts else {}
+    changed = [
+        name for name, fingerprint in inputs(run.flags).items() if known.get(name, fingerprint) != fingerprint
+    ]
+    if changed:
+        raise ValueError(
+            f"{run.folder} was begun with other files than now lie at its paths ({', '.join(changed)}); put them back, "
+            "choose another --output, or remove the folder to train anew"
         )
 
 
@@ -152,6 +168,7 @@ class StartLog:
                 "from_step": reached.step if reached else 0,
                 "rounds_adopted": rounds
                 - used,  # finished after the checkpoint: the student meets them earlier
+                "inputs": inputs(run.flags),
                 **provenance(),
             }
         )
