@@ -236,6 +236,15 @@ def test_what_is_allowed_and_seldom_wanted_is_said(
     assert said in caplog.text
 
 
+def test_failures_whose_actions_are_the_teachers_need_no_warning(
+    guided_config, demonstrations, tmp_path, caplog
+):
+    mixing = MixingConfig(relabel=True)
+    collect = CollectConfig(env=FittingEnv(), strategy="mixing", mixing=mixing, keep_failures=True)
+    train_step(guided_config(collect=collect), demonstrations, RunInfo(output_dir=tmp_path))
+    assert "imitates the failures" not in caplog.text
+
+
 @pytest.mark.parametrize(
     ("name", "value"), [("seed", 7), ("strategy", "replay"), ("teacher", "elsewhere"), ("environment", None)]
 )

@@ -74,9 +74,19 @@ class DistilledConfig:
     representation: RepresentationConfig = field(default_factory=RepresentationConfig)
 
     @property
+    def present_step(self) -> int:
+        """Index of the current step in a chunk; before it lies the past that diffusion policies predict too."""
+        return self.chunk_offsets.index(0)  # type: ignore[attr-defined]
+
+    @property
+    def future_steps(self) -> int:
+        """Steps S of a chunk from the current one on."""
+        return len(self.chunk_offsets) - self.present_step  # type: ignore[attr-defined]
+
+    @property
     def predicted_steps(self) -> int:
-        """Steps from the current one on that `predict_action_chunk` returns."""
-        return sum(offset >= 0 for offset in self.chunk_offsets)  # type: ignore[attr-defined]
+        """Those of them that `predict_action_chunk` returns."""
+        return self.future_steps
 
     def _save_pretrained(self, save_directory: Path) -> None:
         # The environment stays out of config.json: a checkpoint must load where its type is not registered.

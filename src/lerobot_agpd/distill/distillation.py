@@ -30,7 +30,7 @@ from lerobot_agpd.collect.report import success_rate
 from lerobot_agpd.collect.seeds import noise_seed
 from lerobot_agpd.collect.strategies import round_strength
 from lerobot_agpd.distill.adversary import adversary_terms
-from lerobot_agpd.distill.guided import Proposer, present_step
+from lerobot_agpd.distill.guided import Proposer
 from lerobot_agpd.distill.parts import (
     check_steps,
     make_own_teacher,
@@ -143,7 +143,7 @@ class Distillation:
         chosen = torch.ones_like(rows[ROW], dtype=torch.bool)
         if self.config.replay.relabel == "demonstrations":
             chosen = rows[ROW] < self.replay.n_demonstration_frames
-        present = present_step(self.config)
+        present = self.config.present_step
         action, is_pad = rows[ACTION].clone(), rows["action_is_pad"].clone()
         action[chosen, present : present + shared] = chunks[chosen, :shared]
         is_pad[chosen, present : present + shared] = False
@@ -262,7 +262,7 @@ class Distillation:
             return rows, chunks, compared.expand(len(chunks), -1)
         kept = rows[ROW] >= self.replay.n_demonstration_frames
         rows = {key: value[kept] for key, value in rows.items()}
-        present = present_step(self.config)
+        present = self.config.present_step
         return rows, rows[ACTION][:, present:], ~rows["action_is_pad"][:, present:]
 
     def _representation_loss(self, rows: Batch) -> tuple[Tensor | float, dict[str, float]]:

@@ -105,16 +105,6 @@ class Proposer:
         )
 
 
-def present_step(config: Any) -> int:
-    """Index of the current step in a student's chunk; before it lies the past that diffusion policies predict too."""
-    return config.chunk_offsets.index(0)
-
-
-def future_steps(config: Any) -> int:
-    """Steps S of a student's chunk from the current one on."""
-    return sum(offset >= 0 for offset in config.chunk_offsets)
-
-
 def executed_steps(config: Any, teacher: Teacher | None) -> int:
     """Steps n of a chunk that collection executes and compares; without a teacher, the student's own.
 

@@ -11,7 +11,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot_agpd.collect.round import RoundRunner
 from lerobot_agpd.collect.strategies import needs_guidance
 from lerobot_agpd.distill.environment import check_environment_fits, run_environment
-from lerobot_agpd.distill.guided import executed_steps, future_steps
+from lerobot_agpd.distill.guided import executed_steps
 from lerobot_agpd.distill.own_teacher import OwnTeacher
 from lerobot_agpd.distill.relabel import TeacherChunks
 from lerobot_agpd.distill.state import DistillationState, replay_root
@@ -112,7 +112,8 @@ def make_rounds(
             config.collect.episodes,
             config.guidance.scale,
         )
-    if config.collect.keep_failures and config.replay.relabel != "all":
+    teacher_recorded = config.collect.strategy == "mixing" and config.collect.mixing.relabel
+    if config.collect.keep_failures and config.replay.relabel != "all" and not teacher_recorded:
         logger.warning(
             "--policy.collect.keep_failures=true with --policy.replay.relabel=%s: the student imitates the failures "
             "as they were recorded; --policy.replay.relabel=all gives it the teacher's chunks there",
@@ -175,10 +176,10 @@ def make_teacher_chunks(
     if teacher is None or (config.adversary.weight == 0 and config.replay.relabel == "none"):
         return None
     masks_padding = getattr(config, "do_mask_loss_for_padding", True)  # without that setting: always, as ACT
-    if config.replay.relabel != "none" and not masks_padding and teacher.n_chunk_steps < future_steps(config):
+    if config.replay.relabel != "none" and not masks_padding and teacher.n_chunk_steps < config.future_steps:
         raise ValueError(
             f"--policy.replay.relabel={config.replay.relabel}: the teacher predicts {teacher.n_chunk_steps} steps from "
-            f"the current one on, the student's chunk has {future_steps(config)}, and its loss counts the recorded "
+            f"the current one on, the student's chunk has {config.future_steps}, and its loss counts the recorded "
             "steps behind the teacher's; pass --policy.do_mask_loss_for_padding=true, which leaves them out"
         )
-    return TeacherChunks(teacher, replay, future_steps(config), seed)
+    return TeacherChunks(teacher, replay, config.future_steps, seed)

@@ -18,7 +18,6 @@ from torch import Tensor, nn
 from lerobot_agpd.distill.adversary import Discriminator
 from lerobot_agpd.distill.distillation import Distillation
 from lerobot_agpd.distill.gradient_norms import GradientNorms
-from lerobot_agpd.distill.guided import future_steps
 from lerobot_agpd.guidance.representation import StateRepresentation
 from lerobot_agpd.replay.memory import delivers_single_frames
 from lerobot_agpd.replay.normalisation import Statistics
@@ -78,7 +77,7 @@ class DistilledStudent(nn.Module):
         self.discriminator: Discriminator | None = None
         if config.adversary.weight > 0:
             self.discriminator = Discriminator(
-                future_steps(config), action_dim, self.embedding_dim, config.adversary
+                config.future_steps, action_dim, self.embedding_dim, config.adversary
             )
         self.representation: StateRepresentation | None = None
         if config.representation.type == "state":

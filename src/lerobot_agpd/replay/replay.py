@@ -55,6 +55,7 @@ class Replay:
         self._sources: list[tuple[int, LeRobotDataset]] = [(0, memory.dataset)]
         self._tasks: dict[int, list[str]] = {0: _tasks(memory.dataset)}
         self._n_dropped: int = getattr(config, "drop_n_last_frames", 0)  # ACT has no such setting
+        self._demonstrated = _beginnings(memory.dataset, self._n_dropped)
         self._drawn = torch.empty(0, dtype=torch.long)  # rows of `collected_raw` that may begin a chunk
         self._action_offsets = torch.as_tensor(config.chunk_offsets)
         self._n_obs_steps: int | None = config.observation_history
@@ -121,11 +122,7 @@ class Replay:
         if self.collected_share is not None:
             return self.collected_share
         # Uniform over the frames that begin a chunk: on both sides, an episode's dropped ones count for nothing.
-        episodes = self.memory.dataset.meta.episodes
-        lengths = torch.as_tensor(episodes["dataset_to_index"]) - torch.as_tensor(
-            episodes["dataset_from_index"]
-        )
-        demonstrated = int((lengths[sorted(self.seen_episodes)] - self._n_dropped).clamp(min=0).sum())
+        demonstrated = int(self._demonstrated[sorted(self.seen_episodes)].sum())
         return len(self._drawn) / (demonstrated + len(self._drawn))
 
     def training_rows(self, batch: Batch, generator: torch.Generator) -> Batch:
@@ -221,6 +218,14 @@ class Replay:
     def vector_keys(self) -> list[str]:
         """Low-dimensional observation features."""
         return [key for key in self.memory.keys if key != ACTION]
+
+
+def _beginnings(dataset: LeRobotDataset, n_dropped: int) -> Tensor:
+    """Frames (E,) of every episode that may begin a chunk: all but the last `n_dropped`."""
+    starts, ends = (
+        torch.as_tensor(dataset.meta.episodes[f"dataset_{side}_index"]) for side in ("from", "to")
+    )
+    return (ends - starts - n_dropped).clamp(min=0)
 
 
 def _tasks(dataset: LeRobotDataset) -> list[str]:
