@@ -250,6 +250,10 @@ def test_the_report_names_runs_that_another_teacher_taught(compared):
         evaluated, "another"
     )
     assert f"{remark}another: seed-1, seed-2 of pusht/agpd.**" in text("another", "another")
+    results["teacher"] = [
+        replace(result, run=replace(result.run, policy="a/policy_beside")) for result in results["teacher"]
+    ]
+    assert "had the same" not in text("another", "another"), "only the task's own teacher is compared with"
 
 
 def test_differences_without_spread_are_not_shown_as_certain(compared):

@@ -126,7 +126,8 @@ def _remarks(results: Mapping[str, Methods], missing: Sequence[str]) -> list[str
 def _other_inputs(task: str, methods: Methods) -> list[str]:
     """Remarks on a task's runs that did not start from the same files: a teacher trained again is another teacher."""
     runs = [result for entries in methods.values() for result in entries]
-    evaluated = {result.weights for result in runs if result.run.policy}
+    teachers = {result.run.flags.get("policy.teacher.path") for result in runs}
+    evaluated = {result.weights for result in runs if result.run.policy in teachers and result.weights}
     remarks = []
     for kind in ("teacher", "demonstrations"):
         by_file: dict[str, list[str]] = {}
