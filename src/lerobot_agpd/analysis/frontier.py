@@ -50,9 +50,8 @@ def plot_frontier(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
                     f"{strength:g}", (distance, value), fontsize=7, xytext=(3, 3), textcoords="offset points"
                 )
         axis.set(xlabel="rms distance of actions from the teacher's", ylabel=label, xscale="log")
-        axis.xaxis.set_major_locator(
-            LogLocator(subs=(1.0, 2.0, 5.0))
-        )  # a sweep may span less than one decade
+        # A sweep may span less than one decade.
+        axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axis.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         axis.xaxis.set_minor_formatter(NullFormatter())  # labels of minor ticks would overlap
     axes[0].legend(fontsize=8)

@@ -53,7 +53,7 @@ def digest(path: str | Path) -> str:
 
 
 def inputs(flags: Mapping[str, Any]) -> dict[str, str]:
-    """Fingerprints of what a training starts from: the same command makes other teachers on other machines.
+    """Fingerprints of what a training starts from, since a path does not say which files lie there.
 
     Args:
         flags: dotted flags of lerobot-train.
