@@ -1,24 +1,16 @@
-"""What the command line (or config file) says of the running `lerobot-train`, which a policy is never told."""
+"""What a policy must know of the run that trains it: `RunInfo`, resolved once, when the policy is built."""
 
 from __future__ import annotations
 
-import json
-import os
-import tempfile
+import inspect
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import draccus
-import torch
-import yaml
-from lerobot.configs import parser
-from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
+from lerobot.configs import PreTrainedConfig
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.envs import EnvConfig
-from lerobot.transforms import ImageTransforms, ImageTransformsConfig
+from lerobot.transforms import ImageTransforms
 from torch import Tensor
 
 
@@ -27,113 +19,62 @@ class RunInfo:
     """Facts of a training run.
 
     Attributes:
-        output_dir: where the run writes, or None if nobody named a folder.
-        env: the evaluation environment, or None.
-        steps: number of training steps; None if a run that was declared did not say.
+        output_dir: folder that the run writes; None outside of a run.
+        env: evaluation environment, or None.
+        steps: training steps, counted as `--steps` counts them; None if unknown.
+        steps_per_update: of those, steps per optimizer step (gradient accumulation).
         resume: whether the run continues a checkpoint.
         image_transforms: what the loader does to training images (..., C, H, W), or None.
+        averages_weights: whether LeRobot keeps averaged weights of its own (`--ema.enable`).
+        shards_weights: whether parameters are spread over processes (`--parallelism.*`, FSDP).
     """
 
     output_dir: Path | None = None
     env: EnvConfig | None = None
     steps: int | None = None
+    steps_per_update: int = 1
     resume: bool = False
     image_transforms: Callable[[Tensor], Tensor] | None = None
+    averages_weights: bool = False
+    shards_weights: bool = False
+
+    @classmethod
+    def from_train_config(cls, config: TrainPipelineConfig) -> RunInfo:
+        """The facts that a (validated) configuration of `lerobot-train` states.
+
+        Fields that only later releases of LeRobot have count as unset where they are missing.
+        """
+        transforms = config.dataset.image_transforms
+        accelerator, ema = (getattr(config, name, None) for name in ("accelerator", "ema"))
+        accumulation = getattr(accelerator, "gradient_accumulation", None)
+        parallelism = getattr(config, "parallelism", None)
+        return cls(
+            output_dir=config.output_dir,
+            env=config.env,
+            steps=config.steps,
+            steps_per_update=getattr(accumulation, "steps", 1),
+            resume=config.resume,
+            image_transforms=ImageTransforms(transforms) if transforms.enable else None,
+            averages_weights=getattr(ema, "enable", False),
+            shards_weights=getattr(parallelism, "dp_shard", 1) not in (1, None),
+        )
+
+    @classmethod
+    def of(cls, policy_config: PreTrainedConfig) -> RunInfo | None:
+        """The run that is building a policy with this configuration; None outside of training.
+
+        LeRobot tells a policy neither its output folder nor its environment, and re-reading the command line would
+        miss `train(config)` called from Python. Both ways hold the same object: the TrainPipelineConfig whose `policy`
+        is this very configuration, in a function that is building the policy right now.
+        """
+        configs = (config for config in _train_configs_of_callers() if config.policy is policy_config)
+        return next((cls.from_train_config(config) for config in configs), None)
 
 
-_declared: ContextVar[RunInfo | None] = ContextVar("declared_run", default=None)
-
-
-@contextmanager
-def declared_run(info: RunInfo) -> Iterator[None]:
-    """State the facts of a run that is started from Python rather than from a command line."""
-    token = _declared.set(info)
-    try:
-        yield
-    finally:
-        _declared.reset(token)
-
-
-def this_run() -> RunInfo:
-    """Facts of the run in this process: declared ones, else the command line over its config file."""
-    declared = _declared.get()
-    if declared is not None:
-        return declared
-    config = _config_file(parser.parse_arg("config_path"))
-    output_dir = parser.parse_arg("output_dir") or config.get("output_dir")
-    steps = parser.parse_arg("steps") or config.get("steps") or _default("steps")
-    resume = parser.parse_arg("resume") or config.get("resume") or False
-    return RunInfo(
-        output_dir=Path(output_dir) if output_dir else None,
-        env=_env(config.get("env")),
-        steps=int(steps),
-        resume=resume if isinstance(resume, bool) else draccus.decode(bool, yaml.safe_load(resume)),
-        image_transforms=_image_transforms(config.get("dataset")),
-    )
-
-
-def _default(name: str) -> Any:
-    """What lerobot-train takes where nobody says anything."""
-    return next(field.default for field in fields(TrainPipelineConfig) if field.name == name)
-
-
-def process_rank() -> int:
-    """Rank of this process among those that accelerate or torchrun started."""
-    return int(os.environ.get("RANK", "0"))
-
-
-def world_size() -> int:
-    """Number of processes of the run."""
-    return int(os.environ.get("WORLD_SIZE", "1"))
-
-
-def _config_file(path: str | None) -> dict[str, Any]:
-    """Contents of a `--config_path` file or checkpoint folder; empty for none and for a Hub repository."""
-    if not path:
-        return {}
-    file = Path(path) / TRAIN_CONFIG_NAME if Path(path).is_dir() else Path(path)
-    if not file.is_file():
-        return {}
-    text = file.read_text()
-    return (json.loads(text) if file.suffix == ".json" else yaml.safe_load(text)) or {}
-
-
-def _env(config: dict[str, Any] | None) -> EnvConfig | None:
-    """The environment of `--env.*`, its flags over the config file's entry."""
-    entry = dict(config or {})
-    chosen = parser.parse_arg("env.type") or entry.get("type")
-    if chosen is None:
-        return None
-    if chosen != entry.pop("type", None):
-        entry = {}  # another type on the command line: the file's fields are not its fields
-    return _group(EnvConfig.get_choice_class(chosen), entry, "env")
-
-
-def _image_transforms(config: dict[str, Any] | None) -> ImageTransforms | None:
-    """The transforms of `--dataset.image_transforms.*`, as LeRobot's `make_dataset` builds them."""
-    entry = (config or {}).get("image_transforms") or {}
-    transforms = _group(ImageTransformsConfig, entry, "dataset.image_transforms")
-    return ImageTransforms(transforms) if transforms.enable else None
-
-
-def _group(kind: type, entry: dict[str, Any], name: str) -> Any:
-    """A group of flags: the config file's entry, and what the command line says of `--<name>.*` over it."""
-    with tempfile.NamedTemporaryFile("w", suffix=".json") as file, draccus.config_type("json"):
-        json.dump(entry, file)
-        file.flush()
-        return draccus.parse(kind, config_path=file.name, args=parser.get_cli_overrides(name) or [])
-
-
-def barrier() -> None:
-    """Wait for all processes of the run."""
-    if torch.distributed.is_available() and torch.distributed.is_initialized():
-        torch.distributed.barrier()
-
-
-def broadcast(value: Any) -> Any:
-    """Rank 0's value, on every process."""
-    if not (torch.distributed.is_available() and torch.distributed.is_initialized()):
-        return value
-    values = [value]
-    torch.distributed.broadcast_object_list(values, src=0)
-    return values[0]
+def _train_configs_of_callers() -> Iterator[TrainPipelineConfig]:
+    frame = inspect.currentframe()
+    while frame is not None:
+        for value in frame.f_locals.values():
+            if isinstance(value, TrainPipelineConfig):
+                yield value
+        frame = frame.f_back

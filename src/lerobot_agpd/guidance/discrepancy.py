@@ -1,6 +1,6 @@
 """The discrepancy J between a teacher's chunk and the student's (section 4.2, appendix A.4).
 
-A discrepancy is a function of the teacher's chunk, (B, H, A) in the teacher's normalised space, that returns
+A discrepancy is a function of the teacher's chunk, (B, H, A) in the teacher's normalized space, that returns
 J for every row, (B,). It is differentiable, and the student's chunk is fixed inside it.
 """
 
@@ -22,7 +22,7 @@ class ActionDiscrepancy:
     """J = 1/2 ||A - A_hat||^2 over the executed steps: the ablation without a learned representation.
 
     Attributes:
-        target: (B, n, A) the student's executed steps A_hat in the teacher's normalised space.
+        target: (B, n, A) the student's executed steps A_hat in the teacher's normalized space.
         start: index of the current step in the teacher's chunk.
     """
 
@@ -44,9 +44,9 @@ class StateDiscrepancy:
 
     Attributes:
         representation: the predictor of future observations.
-        observation: (B, D) current observation in the student's normalised space.
-        target: (B, n, A) the student's executed steps in the student's normalised space.
-        to_student: differentiable map of actions from the teacher's to the student's normalised space.
+        observation: (B, D) current observation in the student's normalized space.
+        target: (B, n, A) the student's executed steps in the student's normalized space.
+        to_student: differentiable map of actions from the teacher's to the student's normalized space.
         reference: ActionDiscrepancy of the same two chunks.
     """
 
@@ -63,14 +63,14 @@ class StateDiscrepancy:
         gap = self.representation(self.observation, executed) - self.representation(
             self.observation, self.target
         )
-        j = gap.square().sum(dim=1)
-        return j * self._unit(j, chunk)
+        squared = gap.square().sum(dim=1)
+        return squared * self._rescaling(squared, chunk)
 
-    def _unit(self, j: Tensor, chunk: Tensor) -> Tensor:
+    def _rescaling(self, squared: Tensor, chunk: Tensor) -> Tensor:
         """Mean gradient norm of the action J over that of this J; a constant factor."""
         if not chunk.requires_grad:
             return torch.ones((), device=chunk.device)
-        own = torch.autograd.grad(j.sum(), chunk, retain_graph=True)[0].flatten(1).norm(dim=1).mean()
+        own = torch.autograd.grad(squared.sum(), chunk, retain_graph=True)[0].flatten(1).norm(dim=1).mean()
         reference = gradient(self.reference, chunk)[1].flatten(1).norm(dim=1).mean()
         return (reference / own.clamp_min(1e-12)).detach()
 
@@ -82,5 +82,5 @@ def gradient(discrepancy: Discrepancy, chunk: Tensor) -> tuple[Tensor, Tensor]:
     """
     with torch.enable_grad():
         chunk = chunk.detach().clone().requires_grad_(True)
-        j = discrepancy(chunk)
-        return j.detach(), torch.autograd.grad(j.sum(), chunk)[0]
+        value = discrepancy(chunk)
+        return value.detach(), torch.autograd.grad(value.sum(), chunk)[0]

@@ -16,9 +16,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
+from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 from torch import Tensor, nn
 
+from lerobot_agpd.config import GuidancePoint
 from lerobot_agpd.guidance.discrepancy import Discrepancy, gradient
+
+TRUST_REGION = 1.0
+"""Largest shift of a denoising step, as a multiple of that step's sigma."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +35,7 @@ class Posterior:
     x0_hat: Tensor
 
 
-def posterior(scheduler: Any, timestep: int, x_t: Tensor, x0_hat: Tensor, prev_sample: Tensor) -> Posterior:
+def posterior(scheduler: DDPMScheduler | DDIMScheduler, timestep: int, x_t: Tensor, x0_hat: Tensor, prev_sample: Tensor) -> Posterior:
     """Posterior of a diffusers DDPM or DDIM step, with strided schedules (DDPM, arXiv:2006.11239, Eq. 6-7).
 
     At eta = 0, DDIM adds no noise and its own sigma is 0, which would switch guidance off; sigma^2 is
@@ -61,6 +66,25 @@ def posterior(scheduler: Any, timestep: int, x_t: Tensor, x0_hat: Tensor, prev_s
     return Posterior(mean=mean, variance=variance, x0_hat=x0_hat)
 
 
+@dataclass(frozen=True)
+class GuidedStep:
+    """What a guide did in one step.
+
+    Attributes:
+        timestep: diffusion step k, or the time tau of a flow.
+        sigma: standard deviation of the step.
+        discrepancy: (B,) J where it was differentiated.
+        shift: (B, H, A) what was added.
+        x0_hat: (B, H, A) the predicted clean chunk.
+    """
+
+    timestep: float
+    sigma: float
+    discrepancy: Tensor
+    shift: Tensor
+    x0_hat: Tensor
+
+
 @dataclass
 class Guide:
     """Pulls a teacher's chunks toward the student's.
@@ -68,44 +92,41 @@ class Guide:
     Attributes:
         discrepancy: J as a function of the teacher's chunk.
         scale: (B,) guidance scale of every row; rows at 0 are sampled exactly as without a guide.
-        at: "x0" or "mu", where J is differentiated.
-        trust_region: largest root-mean-square shift over the guided entries, in sigmas.
-        callback: called with a dict after every step (`timestep`, `sigma`, `j`, `shift`, `x0_hat`); the timestep
-            is the diffusion step k, or the time tau of a flow.
+        at: where J is differentiated.
+        callback: called with every step's GuidedStep, to look inside.
         shift_in_sigmas: per step, (B,) root-mean-square shift divided by sigma; filled while sampling.
-        j: per step, (B,) J where it was differentiated; filled while sampling.
     """
 
     discrepancy: Discrepancy
     scale: Tensor
-    at: str = "x0"
-    trust_region: float = 1.0
-    callback: Callable[[dict[str, Any]], None] | None = None
+    at: GuidancePoint = "x0"
+    callback: Callable[[GuidedStep], None] | None = None
     shift_in_sigmas: list[Tensor] = field(default_factory=list)
-    j: list[Tensor] = field(default_factory=list)
+
+    @property
+    def acts(self) -> bool:
+        """Whether any row is guided."""
+        return bool((self.scale > 0).any())
 
     def shift(self, step: Posterior, timestep: float) -> Tensor:
         """What to add to x_{k-1} (of a flow: to x0_hat), (B, H, A).
 
         Two caps make up the trust region. scale * sigma^2 is cut at 1, where the explicit step of the
         quadratic J lands on the student (beyond 2 it would diverge). Then the step's length is cut at
-        `trust_region` sigmas, so that a guided step stays as likely as a large draw of the teacher's noise.
+        TRUST_REGION sigmas, so that a guided step stays as likely as a large draw of the teacher's noise.
         """
         point = step.x0_hat if self.at == "x0" else step.mean
-        j, grad = gradient(self.discrepancy, point)
+        discrepancy, grad = gradient(self.discrepancy, point)
         sigma = step.variance**0.5
         factor = (self.scale * step.variance).clamp(max=1.0).to(grad)  # (B,)
         shift = -factor[:, None, None] * grad  # (B, H, A)
         length = _rms_over_nonzero(shift)  # (B,)
-        cap = (self.trust_region * sigma / length.clamp_min(1e-12)).clamp(max=1.0)
+        cap = (TRUST_REGION * sigma / length.clamp_min(1e-12)).clamp(max=1.0)
         shift = shift * cap[:, None, None]
         if sigma > 0:
             self.shift_in_sigmas.append(length * cap / sigma)
-            self.j.append(j)
         if self.callback is not None:
-            self.callback(
-                {"timestep": timestep, "sigma": sigma, "j": j, "shift": shift, "x0_hat": step.x0_hat}
-            )
+            self.callback(GuidedStep(timestep, sigma, discrepancy, shift, step.x0_hat))
         return shift
 
 
@@ -133,7 +154,7 @@ class GuidedScheduler:
 @contextmanager
 def guided(model: nn.Module, guide: Guide | None) -> Iterator[None]:
     """Sample from a LeRobot DiffusionModel under a guide; without one, or at scale 0, the model is untouched."""
-    if guide is None or not bool((guide.scale > 0).any()):
+    if guide is None or not guide.acts:
         yield
         return
     scheduler = model.noise_scheduler

@@ -5,7 +5,17 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from lerobot_agpd.guidance.config import RepresentationConfig
+WIDTH, N_LAYERS, N_HEADS = 128, 2, 4
+"""Of the transformer encoder: token width, layers, attention heads."""
+
+LATENT_DIM = 32
+"""Dimensions L of the latent z."""
+
+WEIGHT = 1.0
+"""Weight of the reconstruction loss in the training objective."""
+
+LR = 1e-3
+"""Learning rate of the representation."""
 
 
 class StateRepresentation(nn.Module):
@@ -19,24 +29,23 @@ class StateRepresentation(nn.Module):
         observation_dim: D, all low-dimensional observation features side by side.
         action_dim: A.
         n_steps: n, executed steps per chunk.
-        config: sizes.
     """
 
-    def __init__(self, observation_dim: int, action_dim: int, n_steps: int, config: RepresentationConfig):
+    def __init__(self, observation_dim: int, action_dim: int, n_steps: int):
         super().__init__()
         self.n_steps = n_steps
-        self.observation_token = nn.Linear(observation_dim, config.width)
-        self.action_token = nn.Linear(action_dim, config.width)
-        self.position = nn.Parameter(torch.randn(1 + n_steps, config.width) * 0.02)
+        self.observation_token = nn.Linear(observation_dim, WIDTH)
+        self.action_token = nn.Linear(action_dim, WIDTH)
+        self.position = nn.Parameter(torch.randn(1 + n_steps, WIDTH) * 0.02)
         layer = nn.TransformerEncoderLayer(
-            config.width, config.n_heads, 4 * config.width, dropout=0.0, batch_first=True, norm_first=True
+            WIDTH, N_HEADS, 4 * WIDTH, dropout=0.0, batch_first=True, norm_first=True
         )
-        self.encoder = nn.TransformerEncoder(layer, config.n_layers, enable_nested_tensor=False)
-        self.to_latent = nn.Linear(config.width, config.latent_dim)
+        self.encoder = nn.TransformerEncoder(layer, N_LAYERS, enable_nested_tensor=False)
+        self.to_latent = nn.Linear(WIDTH, LATENT_DIM)
         self.decoder = nn.Sequential(
-            nn.Linear(config.latent_dim, config.width),
+            nn.Linear(LATENT_DIM, WIDTH),
             nn.GELU(),
-            nn.Linear(config.width, observation_dim),
+            nn.Linear(WIDTH, observation_dim),
         )
 
     def encode(self, observation: Tensor, actions: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ How a policy is sampled is the business of an adapter, one small class per famil
     diffusion and subclasses    adapters/diffusion.py            the scheduler's step
     multi_task_dit              adapters/flow.py                 the scheduler's step, or the velocity
     pi0, pi05, smolvla          adapters/rtc.py                  the velocity, through LeRobot's RTC hook
-    any other                   adapters/chunk.py                - (it can be replayed and mixed)
+    any other                   adapters/chunk.py                - (it can act alone or beside the student)
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
 
 import torch
 from lerobot.configs import PolicyFeature
@@ -30,9 +30,9 @@ from lerobot.utils.constants import ACTION
 from lerobot.utils.random_utils import seeded_context
 from torch import Tensor
 
-from lerobot_agpd.guidance.config import GUIDANCE_POINTS
+from lerobot_agpd.config import FlagError, GuidancePoint, require
 from lerobot_agpd.guidance.guide import Guide
-from lerobot_agpd.guidance.units import ActionUnits
+from lerobot_agpd.guidance.action_normalizer import ActionNormalizer
 
 Features = Mapping[str, PolicyFeature]
 
@@ -69,13 +69,13 @@ class Teacher(ABC):
         self.policy: Any = policy
         self._preprocessor = preprocessor
         self._postprocessor = postprocessor
-        normalisers = [step for step in preprocessor.steps if isinstance(step, NormalizerProcessorStep)]
-        if not normalisers:
+        normalizers = [step for step in preprocessor.steps if isinstance(step, NormalizerProcessorStep)]
+        if not normalizers:
             raise ValueError(
-                f"the preprocessor of the {self.type} teacher has no normaliser, so its action space is unknown; "
+                f"the preprocessor of the {self.type} teacher has no normalizer, so its action space is unknown; "
                 f"its steps are {[type(step).__name__ for step in preprocessor.steps]}"
             )
-        self._units = ActionUnits(normalisers[0], self.action_feature.shape[0])
+        self._action_normalizer = ActionNormalizer(normalizers[0], self.action_feature.shape[0])
         if any(
             isinstance(step, RelativeActionsProcessorStep) and step.enabled for step in preprocessor.steps
         ):
@@ -133,18 +133,18 @@ class Teacher(ABC):
         return any(isinstance(step, TokenizerProcessorStep) for step in self._preprocessor.steps)
 
     @property
-    def guidance_points(self) -> tuple[str, ...]:
+    def guidance_points(self) -> tuple[GuidancePoint, ...]:
         """Where J can be differentiated (`--policy.guidance.at`)."""
-        return GUIDANCE_POINTS if self.can_be_guided else ()
+        return get_args(GuidancePoint) if self.can_be_guided else ()
 
     # ---- action spaces ----
 
-    def to_units(self, actions_raw: Tensor) -> Tensor:
-        """Raw actions (..., A) in the teacher's normalised space (`guidance/units.py`)."""
-        return self._units.of(actions_raw)
+    def normalize(self, actions_raw: Tensor) -> Tensor:
+        """Raw actions (..., A) in the teacher's normalized space."""
+        return self._action_normalizer.normalize(actions_raw)
 
-    def to_raw(self, actions: Tensor) -> Tensor:
-        """Actions (..., A) of the teacher's normalised space in the environment's units."""
+    def unnormalize(self, actions: Tensor) -> Tensor:
+        """Actions (..., A) of the teacher's normalized space in the environment's units."""
         return self._postprocessor(actions).to(actions.device)
 
     # ---- sampling ----
@@ -166,19 +166,20 @@ class Teacher(ABC):
 
         Raises:
             KeyError: if the history lacks a feature or the instruction.
-            ValueError: if the history is too short, or the teacher cannot be guided this way.
+            ValueError: if the history is too short.
+            FlagError: if the teacher cannot be guided this way.
         """
         if guide is not None:
             self.require_guidance(guide.at)
         with _eval_mode(self.policy):
             chunk = self._sample_chunk(self._prepare(history), guide, generator)  # (B, H, A)
-        return self.to_raw(chunk[:, self.start : self.start + self.n_chunk_steps])
+        return self.unnormalize(chunk[:, self.start : self.start + self.n_chunk_steps])
 
     @abstractmethod
     def _sample_chunk(
         self, batch: dict[str, Any], guide: Guide | None, generator: torch.Generator | None
     ) -> Tensor:
-        """The whole internal chunk, (B, H, A), in the teacher's normalised space; called inside no_grad.
+        """The whole internal chunk, (B, H, A), in the teacher's normalized space; called inside no_grad.
 
         Args:
             batch: preprocessed features (B, n_obs_steps, ...), and whatever else the preprocessor made of the
@@ -187,29 +188,29 @@ class Teacher(ABC):
             generator: of the noise; `seeded_by` serves code that takes none.
         """
 
-    def require_guidance(self, at: str) -> None:
+    def require_guidance(self, at: GuidancePoint) -> None:
         """Refuse guidance that this teacher cannot follow.
 
         Raises:
-            ValueError: if it cannot be guided, or not at this point.
+            FlagError: if it cannot be guided, or not at this point.
         """
-        if not self.can_be_guided:
-            raise ValueError(
-                f"a {self.type} teacher predicts its chunk in one pass, so there is no denoising to guide; the "
-                "collection strategies that replay it or mix its actions with the student's are for it "
-                "(--policy.collect.strategy=replay), guidance needs a diffusion or flow-matching teacher"
-            )
-        if at not in self.guidance_points:
-            raise ValueError(
-                f"--policy.guidance.at={at} has no meaning for this {self.type} teacher: a flow has no posterior "
-                f"mean; use --policy.guidance.at={self.guidance_points[0]}"
-            )
+        require(
+            self.can_be_guided,
+            f"--policy.collect.strategy: a {self.type} teacher predicts its chunk in one pass, so there is no denoising "
+            "to guide; let it act alone (--policy.collect.strategy=teacher) or beside the student (mixing), or take a "
+            "diffusion or flow-matching teacher",
+        )
+        require(
+            at in self.guidance_points,
+            f"--policy.guidance.at={at} has no meaning for this {self.type} teacher: a flow has no posterior mean; use "
+            f"--policy.guidance.at={next(iter(self.guidance_points), '')}",
+        )
 
     def set_sampler(self, num_inference_steps: int | None, noise_scheduler: str | None) -> None:
         """Sample otherwise than the checkpoint says; None keeps its way.
 
         Raises:
-            ValueError: if the teacher has no such setting, or not with this value.
+            FlagError: if the teacher has no such setting, or not with this value.
         """
         if num_inference_steps is not None:
             raise self.no_such_setting(
@@ -218,9 +219,9 @@ class Teacher(ABC):
         if noise_scheduler is not None:
             raise self.no_such_setting("noise_scheduler", noise_scheduler, "has no noise scheduler")
 
-    def no_such_setting(self, name: str, value: object, why: str) -> ValueError:
+    def no_such_setting(self, name: str, value: object, why: str) -> FlagError:
         """The error for a `--policy.teacher.*` flag that means nothing to this teacher."""
-        return ValueError(
+        return FlagError(
             f"--policy.teacher.{name}={value} has no meaning for this {self.type} teacher, which {why}; leave "
             "the flag out"
         )

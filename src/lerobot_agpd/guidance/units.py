@@ -1,4 +1,4 @@
-"""A teacher's normalised action space: where its denoising happens, and J compares chunks."""
+"""A teacher's normalized action space: where its denoising happens, and J compares chunks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lerobot.processor import NormalizerProcessorStep
 from torch import Tensor
 
 LEAST_UNIT = 1e-6
-"""Raw size of a normalised unit below which a dimension counts as constant."""
+"""Raw size of a normalized unit below which a dimension counts as constant."""
 
 
 class ActionUnits:
@@ -35,11 +35,11 @@ class ActionUnits:
         )  # what LeRobot makes of the only value
 
     def of(self, actions_raw: Tensor) -> Tensor:
-        """Raw actions (..., A) in the normalised space."""
+        """Raw actions (..., A) in the normalized space."""
         if self._varies is None or self._varies.device != actions_raw.device:
-            low, high = self._normalised(self._ends.to(actions_raw))
+            low, high = self._normalized(self._ends.to(actions_raw))
             self._varies = (high - low).abs() < 1 / LEAST_UNIT  # (A,)
-        return self._normalised(actions_raw).where(self._varies, self._constant)
+        return self._normalized(actions_raw).where(self._varies, self._constant)
 
-    def _normalised(self, actions_raw: Tensor) -> Any:
+    def _normalized(self, actions_raw: Tensor) -> Any:
         return self._normaliser({TransitionKey.ACTION: actions_raw})[TransitionKey.ACTION]

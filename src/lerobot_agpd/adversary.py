@@ -1,22 +1,27 @@
 """Stage 2's adversary: a discriminator of student and teacher chunks, and the student's loss against it.
 
 D(A | z) is the probability that chunk A was predicted by the *student* at an observation embedded as z. D
-minimises cross-entropy; the student minimises log D (Eq. 21). Both happen in one backward pass through a
+minimizes cross-entropy; the student minimizes log D (Eq. 21). Both happen in one backward pass through a
 gradient-reversal layer (arXiv:1409.7495), so one loss and one optimizer serve, and LeRobot's loop stays as it is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
-from torch.nn.utils.parametrizations import spectral_norm
 
-from lerobot_agpd.distill.config import AdversaryConfig
+WIDTH = 128
+"""Width of D's two hidden layers."""
+
+TEACHER_LABEL = 0.1
+"""D's target for teacher chunks: one-sided label smoothing of 0."""
+
+GRADIENT_PENALTY = 1.0
+"""Weight of the penalty on the gradient of D's logit at teacher chunks (R1)."""
 
 
 class _GradientReversal(torch.autograd.Function):
@@ -36,47 +41,41 @@ def reverse_gradient(x: Tensor, strength: float) -> Tensor:
 
 
 class Discriminator(nn.Module):
-    """Two-layer MLP on (chunk, embedding) whose logit is high for student chunks.
+    """MLP with two hidden layers on (chunk, embedding) whose logit is high for student chunks.
 
     Args:
-        n_steps: compared steps n.
+        n_steps: compared steps S.
         action_dim: A.
         embedding_dim: E.
-        config: sizes.
     """
 
-    def __init__(self, n_steps: int, action_dim: int, embedding_dim: int, config: AdversaryConfig):
+    def __init__(self, n_steps: int, action_dim: int, embedding_dim: int):
         super().__init__()
-        wrap: Callable[[nn.Module], nn.Module] = (
-            spectral_norm if config.spectral_norm else lambda layer: layer
-        )
         self.layers = nn.Sequential(
-            wrap(nn.Linear(n_steps * action_dim + embedding_dim, config.width)),
+            nn.Linear(n_steps * action_dim + embedding_dim, WIDTH),
             nn.LeakyReLU(0.2),
-            wrap(nn.Linear(config.width, config.width)),
+            nn.Linear(WIDTH, WIDTH),
             nn.LeakyReLU(0.2),
-            wrap(nn.Linear(config.width, 1)),
+            nn.Linear(WIDTH, 1),
         )
 
     def forward(self, chunk: Tensor, embedding: Tensor) -> Tensor:
-        """Logit that the student made the chunk, (B,), for chunks (B, n, A) and embeddings (B, E)."""
+        """Logit that the student made the chunk, (B,), for chunks (B, S, A) and embeddings (B, E)."""
         return self.layers(torch.cat([chunk.flatten(1), embedding], dim=1))[:, 0]
 
 
 @dataclass(frozen=True)
 class AdversaryTerms:
-    """Terms of the adversarial game; the sum of `discriminator` and `student` is to be minimised.
+    """Terms of the adversarial game.
 
     Attributes:
-        discriminator: D's cross-entropy with its regularisers. Under gradient reversal its gradient with
-            respect to the student's chunk already is the one of s * log D.
-        student: s times the non-saturating student loss, zero when gradient reversal carries it.
+        loss: D's cross-entropy with its penalty, to be minimized. Its gradient with respect to the student's chunk
+            is that of s * log D, because it is reversed.
         log_d: mean log D of the student's chunks, L_AIL of Eq. 21; for the log only.
-        accuracy: share of chunks that D tells right.
+        accuracy: fraction of chunks that D tells right; for the log only.
     """
 
-    discriminator: Tensor
-    student: Tensor
+    loss: Tensor
     log_d: Tensor
     accuracy: Tensor
 
@@ -86,7 +85,7 @@ def adversary_terms(
     student_chunk: Tensor,
     teacher_chunk: Tensor,
     embedding: Tensor,
-    config: AdversaryConfig,
+    weight: float,
 ) -> AdversaryTerms:
     """One round of the game.
 
@@ -95,35 +94,25 @@ def adversary_terms(
 
     Args:
         discriminator: D.
-        student_chunk: (B, n, A) prior chunks of the student, with gradients.
-        teacher_chunk: (B, n, A) the teacher's chunks at the same observations.
+        student_chunk: (B, S, A) prior chunks of the student, with gradients.
+        teacher_chunk: (B, S, A) the teacher's chunks at the same observations.
         embedding: (B, E) observation embeddings z.
-        config: weight s, form and regularisers.
+        weight: s of Eq. 22.
     """
     embedding, teacher_chunk = embedding.detach(), teacher_chunk.detach()
-    saturating = config.form == "saturating"
-    seen = reverse_gradient(student_chunk, config.weight) if saturating else student_chunk.detach()
-    logits_student_is_high = discriminator(seen, embedding)  # (B,) at the student's chunks
+    logits_student_is_high = discriminator(reverse_gradient(student_chunk, weight), embedding)  # (B,)
     logits_at_teacher = discriminator(teacher_chunk, embedding)  # (B,)
-    loss = F.binary_cross_entropy_with_logits(
+    cross_entropy = F.binary_cross_entropy_with_logits(
         logits_student_is_high, torch.ones_like(logits_student_is_high)
     ) + F.binary_cross_entropy_with_logits(
-        logits_at_teacher, torch.full_like(logits_at_teacher, config.label_smoothing)
+        logits_at_teacher, torch.full_like(logits_at_teacher, TEACHER_LABEL)
     )
-    student_loss = torch.zeros_like(loss)
-    if not saturating:
-        frozen = {name: value.detach() for name, value in discriminator.named_parameters()}
-        logits = torch.func.functional_call(discriminator, frozen, (student_chunk, embedding))
-        student_loss = config.weight * F.softplus(logits).mean()  # -log(1 - D)
-    if config.gradient_penalty > 0:
-        penalty = gradient_penalty(discriminator, teacher_chunk, embedding)
-        loss = loss + config.gradient_penalty * penalty
-    right = torch.cat([logits_student_is_high > 0, logits_at_teacher < 0])
+    penalty = gradient_penalty(discriminator, teacher_chunk, embedding)
+    told_right = torch.cat([logits_student_is_high > 0, logits_at_teacher < 0])
     return AdversaryTerms(
-        discriminator=loss,
-        student=student_loss,
+        loss=cross_entropy + GRADIENT_PENALTY * penalty,
         log_d=F.logsigmoid(logits_student_is_high).mean().detach(),
-        accuracy=right.float().mean(),
+        accuracy=told_right.float().mean(),
     )
 
 

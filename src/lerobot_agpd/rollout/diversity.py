@@ -1,7 +1,7 @@
 """How diverse a set of rollouts is: entropy and coverage of states, divergence of actions.
 
 Features are numpy arrays, one row per state or action. Entropy and coverage depend on the features' units:
-standardise every set that is compared with the *same* statistics, best those of the demonstrations.
+standardize every set that is compared with the *same* statistics, best those of the demonstrations.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from scipy.special import digamma, gammaln
 Array = NDArray[np.floating]
 
 
-def standardise(features: ArrayLike, mean: ArrayLike, std: ArrayLike) -> Array:
+def standardize(features: ArrayLike, mean: ArrayLike, std: ArrayLike) -> Array:
     """(features - mean) / std with given statistics.
 
     Args:
@@ -38,15 +38,15 @@ def standardise(features: ArrayLike, mean: ArrayLike, std: ArrayLike) -> Array:
 
 
 def knn_entropy(states: ArrayLike, k: int = 3) -> float:
-    """Differential entropy in nats from k-nearest-neighbour distances.
+    """Differential entropy in nats from k-nearest-neighbor distances.
 
     Kozachenko and Leonenko (1987): h = digamma(N) - digamma(k) + log V_D + D / N sum log r, with r the Euclidean
     distance to the k-th other point and V_D the volume of the unit ball. It assumes independent points: states of one
     episode are not, so compare sets of equal N and equal episode lengths, and read differences, not values.
 
     Args:
-        states: (N, D) independent points, standardised.
-        k: which neighbour.
+        states: (N, D) independent points, standardized.
+        k: which neighbor.
 
     Raises:
         ValueError: for fewer than k + 1 points, or if a point has k exact copies, where the entropy is -inf.
@@ -54,7 +54,7 @@ def knn_entropy(states: ArrayLike, k: int = 3) -> float:
     points = _rows(states, "states")
     n, dim = points.shape
     if k < 1 or n < k + 1:
-        raise ValueError(f"the {k}-th neighbour needs k >= 1 and at least k + 1 = {k + 1} states, got {n}")
+        raise ValueError(f"the {k}-th neighbor needs k >= 1 and at least k + 1 = {k + 1} states, got {n}")
     radii = cKDTree(points).query(points, k=[k + 1])[0][:, 0]  # the nearest is the point itself
     n_repeated = int(np.sum(radii == 0))
     if n_repeated:
@@ -73,8 +73,8 @@ def state_coverage(test: ArrayLike, train: ArrayLike, epsilon: float) -> float:
     successors of one.
 
     Args:
-        test: (N, D) states of the student's own rollouts, standardised.
-        train: (M, D) states in the training data, standardised alike.
+        test: (N, D) states of the student's own rollouts, standardized.
+        train: (M, D) states in the training data, standardized alike.
         epsilon: largest Euclidean distance that counts, in standard deviations; it may be met exactly.
 
     Raises:
@@ -133,36 +133,6 @@ def gaussian_kl(p: Gaussian, q: Gaussian) -> float:
     log_ratio = 2 * np.sum(np.log(np.diag(factor_q)) - np.log(np.diag(factor_p)))  # ln |Sigma_q| / |Sigma_p|
     trace = np.trace(cho_solve((factor_q, True), p.covariance))
     return float(0.5 * (trace - len(gap) + log_ratio + gap @ cho_solve((factor_q, True), gap)))
-
-
-def action_divergence(actions: ArrayLike, reference: ArrayLike, shrinkage: float = 0.1) -> Array:
-    """KL(actions || reference) of moment-matched Gaussians, per observation, in nats (Eq. 14).
-
-    Two sets from one policy do not give 0: without shrinkage the mean is about p / 2 (1/N + 1/M) with
-    p = D + D (D + 1) / 2 fitted numbers, for N, M >> D. Report that baseline beside the result, or measure it.
-
-    Args:
-        actions: (O, N, D) N draws of the executed actions, or flattened chunks, at each of O observations.
-        reference: (O, M, D) draws of the unguided teacher at the same observations.
-        shrinkage: as in `match_moments`, for both.
-
-    Returns:
-        (O,) divergences.
-
-    Raises:
-        ValueError: if the shapes do not match, or as `match_moments` and `gaussian_kl` say.
-    """
-    ours, theirs = np.asarray(actions, dtype=float), np.asarray(reference, dtype=float)
-    if ours.ndim != 3 or theirs.ndim != 3 or ours.shape[::2] != theirs.shape[::2]:
-        raise ValueError(
-            f"need (O, N, D) and (O, M, D) with equal O and D, got {ours.shape} and {theirs.shape}"
-        )
-    return np.array(
-        [
-            gaussian_kl(match_moments(a, shrinkage), match_moments(b, shrinkage))
-            for a, b in zip(ours, theirs, strict=True)
-        ]
-    )
 
 
 def _rows(values: ArrayLike, name: str) -> Array:

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from lerobot.policies import PreTrainedPolicy, make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
 from lerobot_agpd.guidance.adapters import as_teacher
 from lerobot_agpd.guidance.teacher import Teacher
-from lerobot_agpd.replay.normalisation import Statistics
-
-if TYPE_CHECKING:
-    from lerobot_agpd.distill.student import DistilledStudent
+from lerobot_agpd.replay.normalization import Statistics
+from lerobot_agpd.student import Student
 
 PREVIOUS_SELF = "previous_self.safetensors"
 
 
-class OwnTeacher:
+class SelfTeacher:
     """Snapshots of a student: the newest one acts as teacher, the one before proposes.
 
     A snapshot holds the weights the student would be evaluated with (averaged ones, if it averages). It is taken
@@ -26,9 +23,12 @@ class OwnTeacher:
 
     Args:
         student: the policy in training.
+
+    Attributes:
+        previous: the snapshot that proposes; None until two have been taken.
     """
 
-    def __init__(self, student: DistilledStudent):
+    def __init__(self, student: Student):
         self.student = student
         self.previous: PreTrainedPolicy | None = None
         self._newest: PreTrainedPolicy | None = None
@@ -41,7 +41,7 @@ class OwnTeacher:
         """
         self.previous = self._newest
         self._newest = self.student.snapshot()
-        processors = make_pre_post_processors(self.student.config, dataset_stats=stats)
+        processors = make_pre_post_processors(self.student.config, dataset_stats=dict(stats))
         return as_teacher(self._newest, *processors)
 
     def save(self, folder: Path) -> None:

@@ -1,0 +1,360 @@
+"""Adaptive Guidance Policy Distillation (AGPD), top to bottom in the order of the paper.
+
+    T = demonstrations
+    every `collect.every` training steps
+        stage 1   A_hat = pi_phi(O)                             Eq. 19      GuidedStrategy.act
+                  A ~ teacher, its denoising pulled to A_hat    Eq. 20      GuidedStrategy.act
+                  execute A, keep what succeeds: T += episode               AGPD.collect_round
+                  adapt the guidance scale                                  next_scale
+    every training step
+        stage 2   minimize L_IL + s * L_AIL on T                Eq. 21-22   AGPD.losses
+                  predict O_{t+n} from O_t and A                A.4         AGPD.losses
+
+| paper                  | here                                                                                       |
+| ---------------------- | ------------------------------------------------------------------------------------------ |
+| pi_theta, distilled DM | teacher: frozen, in guidance/teacher.py                                                    |
+| pi_phi                 | student: what is needed of it is in student.py                                             |
+| A_hat                  | chunk_hat, (B, S, A), the student's chunk                                                  |
+| J, F_measure           | discrepancy, (B,), between a chunk of the teacher and A_hat (guidance/discrepancy.py)      |
+| k                      | guidance scale; `strength` of an episode, at 0 the teacher acts alone                      |
+| D_w, s                 | discriminator, adversary.weight (adversary.py)                                             |
+| E, D of A.4            | representation (guidance/representation.py)                                                |
+| T                      | replay, in memory (replay/replay.py); journal, on disk (replay/journal.py)                 |
+
+LeRobot's own training loop drives it, through policies/distilled.py; build.py puts the parts together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from accelerate import PartialState
+from lerobot.utils.constants import ACTION
+from lerobot.utils.random_utils import seeded_context
+from torch import Tensor
+
+from lerobot_agpd.adversary import Discriminator, adversary_terms
+from lerobot_agpd.build import Parts
+from lerobot_agpd.config import CollectConfig, GuidanceConfig, StudentConfig
+from lerobot_agpd.guidance.guide import Guide
+from lerobot_agpd.guidance.representation import WEIGHT, reconstruction_loss
+from lerobot_agpd.guidance.teacher import History, Teacher
+from lerobot_agpd.guidance.teacher_student import TeacherStudent
+from lerobot_agpd.replay.replay import FRAME_INDEX, Batch, Replay
+from lerobot_agpd.rollout.report import RoundReport, log_round, round_scalars, success_rate
+from lerobot_agpd.rollout.seeds import STUDENT_NOISE_STREAM
+from lerobot_agpd.rollout.strategies import (
+    ChunkBatch,
+    MixingStrategy,
+    RollInStrategy,
+    Strategy,
+    TeacherStrategy,
+    unknown,
+)
+from lerobot_agpd.rollout.success import classify
+from lerobot_agpd.student import PriorChunk, Student, StudentSampler
+
+GROWTH = 2.0
+"""Factor by which the guidance scale grows after a good round and shrinks after a bad one."""
+
+TOLERANCE = 0.05
+"""How far the guided teacher's success rate may fall below its own in a good round."""
+
+MIN_SCALE = 0.05
+"""An adapted guidance scale never falls below this."""
+
+ADVERSARY_LOG = ("discriminator_loss", "adversarial_loss", "discriminator_accuracy")
+
+
+# ---- stage 1: guided collection ----
+
+
+class GuidedStrategy(Strategy):
+    """The teacher denoises, pulled toward the chunk that the student proposes (Eq. 19-20)."""
+
+    def __init__(self, pair: TeacherStudent, generator: torch.Generator, config: GuidanceConfig):
+        super().__init__(pair, generator)
+        self.config = config
+
+    def act(self, history: History, strength: Tensor, student_acts: Tensor | None = None) -> ChunkBatch:
+        """Guided chunks; `strength` is the guidance scale, rows at 0 are the teacher's own bit for bit."""
+        chunk_hat = self.pair.propose(history)  # A_hat = pi_phi(O), Eq. 19: (B, S, A), student-normalized
+        action_j = self.pair.action_discrepancy(chunk_hat)
+        guide = None
+        if bool((strength > 0).any()):  # else the teacher need not be one that can be guided
+            discrepancy = self.pair.guiding_discrepancy(history, chunk_hat, action_j)  # J(., A_hat)
+            guide = Guide(discrepancy, strength.to(chunk_hat.device), at=self.config.at)
+        actions = self.pair.teacher_actions(history, self.generator, guide)  # Eq. 20: (B, n, A), raw
+        shift = unknown(actions).to(chunk_hat.device)
+        if guide is not None and guide.shift_in_sigmas:
+            mean_shift = torch.stack(guide.shift_in_sigmas).mean(dim=0)  # (B,)
+            shift = torch.where(guide.scale.to(mean_shift) > 0, mean_shift, torch.nan)
+        return ChunkBatch(
+            actions,
+            discrepancy=self.pair.executed_discrepancy(actions, action_j.target),
+            guidance_shift=shift,
+        )
+
+
+def make_strategy(config: StudentConfig, pair: TeacherStudent, generator: torch.Generator) -> Strategy:
+    """The strategy that `config.collect` names: AGPD's, or one that it is compared with."""
+    if config.collect.strategy == "teacher":
+        return TeacherStrategy(pair, generator)
+    if config.collect.strategy == "mixing":
+        return MixingStrategy(pair, generator, config.collect.mixing)
+    guided = GuidedStrategy(pair, generator, config.guidance)
+    return RollInStrategy(guided) if config.collect.strategy == "rollin" else guided
+
+
+def next_scale(
+    scale: float, guided_success: float | None, teacher_success: float | None, config: GuidanceConfig
+) -> float:
+    """Guidance scale of the next round: the "adaptive" in AGPD.
+
+    A round is good if guided episodes succeed as often as the teacher's own, up to TOLERANCE; then the scale grows
+    by GROWTH, else it shrinks by the same factor. While the student is weak its pull costs success and the scale
+    stays small; as the student improves the scale rises.
+
+    Args:
+        scale: of the finished round.
+        guided_success: success rate of its guided episodes, None if there were none.
+        teacher_success: success rate of the teacher alone, None if unknown.
+        config: upper limit; a first scale beyond a limit only ever moves back toward it.
+    """
+    if not config.adaptive or guided_success is None or teacher_success is None or config.scale == 0:
+        return scale
+    if guided_success >= teacher_success - TOLERANCE:
+        return max(scale, min(scale * GROWTH, config.max_scale))
+    return min(scale, max(scale / GROWTH, MIN_SCALE))
+
+
+def rounds_due(step: int, config: CollectConfig) -> int:
+    """Rounds that are due after a number of training steps: the first after the warm-up, then one every `every`."""
+    if not config.enabled or step < config.warmup:
+        return 0
+    due = 1 + (step - config.warmup) // config.every
+    return due if config.rounds is None else min(due, config.rounds)
+
+
+# ---- stage 2: training ----
+
+
+@dataclass(frozen=True)
+class AdversaryBatch:
+    """What the discriminator compares the student with at a training step.
+
+    Attributes:
+        batch: the frames concerned.
+        chunk: (B, S, A) the teacher's chunks there, in the student's normalized space.
+        compared: (B, S) bool, True on the steps that teacher and student both have.
+    """
+
+    batch: Batch
+    chunk: Tensor
+    compared: Tensor
+
+
+@dataclass(frozen=True)
+class Losses:
+    """What AGPD adds to L_IL: a loss to be minimized, and its terms for the log."""
+
+    total: Tensor
+    log: dict[str, float]
+
+
+class AGPD:
+    """The two stages and their alternation, for one student in training.
+
+    Args:
+        student: the policy in training.
+        parts: teacher, replay, collector and the rest, as `build.build_parts` makes them.
+    """
+
+    def __init__(self, student: Student, parts: Parts):
+        self.student = student
+        self.config = student.config
+        self.run, self.progress = parts.run, parts.progress
+        self.replay, self.teacher_chunks = parts.replay, parts.teacher_chunks
+        self.teacher, self.self_teacher = parts.teacher, parts.self_teacher
+        self.collector, self.journal = parts.collector, parts.journal
+        self.seed, self.rank = parts.seed, parts.rank
+        self.reports = list(parts.reports)
+        self._micro_batch = 0  # since the last update, if gradients are accumulated
+
+    # ---- the alternation ----
+
+    def after_update(self) -> bool:
+        """Count an optimizer step, and collect if a round is due; runs on every process.
+
+        Returns:
+            Whether this was the last step of the run.
+        """
+        before, self.progress.step = self.progress.step, self.progress.step + self.run.steps_per_update
+        self.progress.seen_episodes = sorted(self.replay.seen_episodes)
+        due = rounds_due(self.progress.step, self.config.collect)
+        is_last = self.run.steps is not None and self.progress.step >= self.run.steps
+        # None after the last step, because no student would learn from it; none twice, if a killed run has it already.
+        if due > rounds_due(before, self.config.collect) and due > len(self.reports) and not is_last:
+            self.collect_round()
+        return is_last
+
+    # ---- stage 1 ----
+
+    @property
+    def scale(self) -> float:
+        """Guidance scale of the next round."""
+        return self.reports[-1].next_scale if self.reports else self.config.guidance.scale
+
+    def collect_round(self) -> RoundReport:
+        """One round: every process rolls out its part, successes become part of T."""
+        assert self.collector is not None and self.journal is not None
+        number, was_training = len(self.reports), self.student.training
+        self.student.eval()
+        with seeded_context(self.collector.stream_seed(number, STUDENT_NOISE_STREAM)):
+            strategy = self._strategy(number)
+            strength = self._strength()
+            done = {record.number for record in self.journal.records(number, self.rank)}
+            for episode in self.collector.roll_out(number, strength, strategy, done):  # execute
+                with strategy.stopwatch.measure("writing"):
+                    record = classify(episode, self.config.collect)  # success filter
+                    self.journal.append(number, self.rank, episode, record)
+        processes = PartialState()
+        processes.wait_for_everyone()
+        if processes.is_main_process:
+            self.journal.finish(number, self._report(number, strength, strategy).to_json())
+        self.student.train(was_training)
+        processes.wait_for_everyone()
+        self.replay.extend(self.journal.kept(number))  # T += episodes
+        self.reports.append(RoundReport.from_json(self.journal.reports()[number]))
+        self.progress.rounds = len(self.reports)
+        if processes.is_main_process:
+            log_round(self.reports[-1])
+        return self.reports[-1]
+
+    def _strategy(self, number: int) -> Strategy:
+        """The configured strategy for a round, with the teacher and the student as they are now."""
+        assert self.collector is not None
+        normalizer, acting = self.replay.demonstrations.normalizer, None
+        if self.self_teacher is not None:
+            self.teacher = self.self_teacher.refresh(normalizer.stats)
+            acting = self.self_teacher.previous
+        assert self.teacher is not None
+        pair = StudentSampler(self.student, normalizer, acting).pair_with(self.teacher)
+        return make_strategy(self.config, pair, self.collector.noise(number))
+
+    def _strength(self) -> float:
+        """Guidance scale or mixing weight of a round's episodes."""
+        has_target = self.self_teacher is None or self.self_teacher.previous is not None
+        if self.config.collect.strategy == "mixing":
+            return self.config.collect.mixing.weight if has_target else 0.0
+        return self.scale if self.config.collect.guides and has_target else 0.0
+
+    def _report(self, number: int, strength: float, strategy: Strategy) -> RoundReport:
+        assert self.collector is not None and self.journal is not None
+        report = RoundReport.of(
+            self.journal.records(number),
+            round=number,
+            step=self.progress.step,
+            strength=strength,
+            next_scale=self.scale,
+            seconds=dict(strategy.stopwatch.seconds),
+            diagnostics=self.collector.diagnose(number, strength, strategy),
+        )
+        return replace(report, next_scale=self._adapted_scale(report)) if self.config.collect.guides else report
+
+    def _adapted_scale(self, report: RoundReport) -> float:
+        # A frozen teacher's own rate is best known from all rounds; one that still learns has only its newest.
+        rounds = [report] if self.self_teacher else [*self.reports, report]
+        guided_success = success_rate([report.strategy])
+        teacher_success = success_rate(entry.teacher_only for entry in rounds)
+        return next_scale(self.scale, guided_success, teacher_success, self.config.guidance)
+
+    # ---- stage 2 ----
+
+    def train_batch(self, batch: Batch) -> Batch:
+        """A batch of T: the loader's frames, a fraction exchanged for collected ones."""
+        self.replay.observe(batch)
+        # Stateless, so that a resumed run draws the same frames.
+        state = hash((self.seed, self.rank, self.progress.step + self._micro_batch))
+        self._micro_batch = (self._micro_batch + 1) % self.run.steps_per_update
+        batch = self.replay.train_batch(batch, torch.Generator().manual_seed(state % 2**63))
+        if self.teacher_chunks is None or self.config.replay.relabel == "none":
+            return batch
+        return self.teacher_chunks.relabel(batch, self.config)
+
+    def eval_batch(self, batch: Batch) -> Batch:
+        """A batch of demonstrations alone, for a held-out loss."""
+        self.replay.demonstrations.observe(batch)
+        return self.replay.eval_batch(batch)
+
+    def adversary_batch(self, batch: Batch) -> AdversaryBatch | None:
+        """The teacher's chunks for the frames of a batch; None where the adversary does not act at this step.
+
+        In self-distillation these are the executed chunks of kept episodes: against its own chunks, D would separate a
+        policy from itself.
+        """
+        config, step = self.config.adversary, self.progress.step
+        if config.weight == 0 or step < config.start or (step // self.run.steps_per_update) % config.every:
+            return None
+        if self.teacher_chunks is not None:
+            chunk, n_shared = self.teacher_chunks.at(batch[FRAME_INDEX])
+            compared = torch.arange(chunk.shape[1], device=chunk.device) < n_shared
+            return AdversaryBatch(batch, chunk, compared.expand(len(chunk), -1))
+        kept = batch[FRAME_INDEX] >= self.replay.n_demonstration_frames
+        batch = {key: value[kept] for key, value in batch.items()}
+        present = self.config.present_step
+        return AdversaryBatch(batch, batch[ACTION][:, present:], ~batch["action_is_pad"][:, present:])
+
+    def losses(
+        self,
+        batch: Batch,
+        reference: AdversaryBatch | None,
+        prior: PriorChunk | None,
+        discriminator: Discriminator | None,
+    ) -> Losses:
+        """What AGPD adds to L_IL on a batch of T: s * L_AIL with D's own loss (Eq. 21-22), and L_recon (A.4).
+
+        Args:
+            batch: of `train_batch`.
+            reference: of `adversary_batch`.
+            prior: the student's chunk and embedding at the reference's frames; None without frames.
+            discriminator: D.
+        """
+        total = torch.zeros((), device=batch[ACTION].device)
+        log = {"collected_fraction": self.replay.collected_fraction} | round_scalars(self.reports)
+        if reference is not None:
+            # LeRobot averages over processes by position: every one needs the same keys.
+            log |= dict.fromkeys(ADVERSARY_LOG, 0.0)
+        if reference is not None and prior is not None and discriminator is not None:
+            mask = reference.compared[..., None]
+            terms = adversary_terms(
+                discriminator,
+                prior.chunk * mask,
+                reference.chunk * mask,
+                prior.embedding,
+                self.config.adversary.weight,
+            )
+            total = total + terms.loss
+            log |= zip(
+                ADVERSARY_LOG, (terms.loss.item(), terms.log_d.item(), terms.accuracy.item()), strict=True
+            )
+        if self.student.representation is not None:
+            representation = self.student.representation
+            future = self.replay.executed_future(
+                batch[FRAME_INDEX], self.config.observed_vectors, representation.n_steps
+            )
+            predicted = representation(future.observation, future.actions)  # O_hat_{t+n}
+            recon = reconstruction_loss(predicted, future.later, future.is_pad)
+            total = total + WEIGHT * recon
+            log["representation_loss"] = recon.item()
+        return Losses(total, log)
+
+    # ---- checkpoints ----
+
+    def save(self, folder: Path) -> None:
+        """Write what a resumed run must know beside a checkpoint's weights."""
+        self.progress.save(folder)
+        if self.self_teacher is not None:
+            self.self_teacher.save(folder)

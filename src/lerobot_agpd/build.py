@@ -1,0 +1,266 @@
+"""Put together what AGPD needs beside the student: teacher, replay, journal and collector, as the flags say."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from accelerate import PartialState
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.envs import EnvConfig
+
+from lerobot_agpd.config import StudentConfig, require
+from lerobot_agpd.guidance.teacher import Teacher
+from lerobot_agpd.loading import check_fit, collection_environment, load_teacher
+from lerobot_agpd.progress import Progress, find_replay_root
+from lerobot_agpd.replay.demonstrations import DemonstrationFrames
+from lerobot_agpd.replay.export import check_observation
+from lerobot_agpd.replay.journal import EpisodeJournal
+from lerobot_agpd.replay.normalization import Statistics
+from lerobot_agpd.replay.replay import Replay
+from lerobot_agpd.replay.teacher_chunks import TeacherChunks
+from lerobot_agpd.rollout.collector import Collector
+from lerobot_agpd.rollout.report import RoundReport
+from lerobot_agpd.run import RunInfo
+from lerobot_agpd.self_distillation import SelfTeacher
+from lerobot_agpd.student import Student, executed_steps
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What AGPD needs beside the student; none of it enters a checkpoint's weights.
+
+    Attributes:
+        run: the training run.
+        progress: counters, restored if the run continues a checkpoint.
+        replay: T.
+        teacher: None without one, and in self-distillation.
+        self_teacher: in self-distillation.
+        teacher_chunks: the teacher's chunks on T; None if neither adversary nor relabeling uses them.
+        collector: None if no round is to be collected.
+        journal: the collected episodes on disk; None if no round is to be collected.
+        reports: of the rounds that T holds already.
+        seed: of environments, sampling noise and the choice of collected frames.
+        rank: of this process.
+    """
+
+    run: RunInfo
+    progress: Progress
+    replay: Replay
+    teacher: Teacher | None
+    self_teacher: SelfTeacher | None
+    teacher_chunks: TeacherChunks | None
+    collector: Collector | None
+    journal: EpisodeJournal | None
+    reports: tuple[RoundReport, ...]
+    seed: int
+    rank: int
+
+
+def build_parts(
+    student: Student,
+    dataset_meta: LeRobotDatasetMetadata | None,
+    dataset_stats: Statistics | None,
+    run: RunInfo,
+    seed: int,
+) -> Parts:
+    """Build the parts, checking that they fit together.
+
+    Args:
+        student: the policy in training.
+        dataset_meta: metadata of the demonstrations.
+        dataset_stats: their statistics.
+        run: the training run.
+        seed: of environments, sampling noise and the choice of collected frames.
+
+    Raises:
+        FlagError: if a teacher or an environment is needed and missing, or does not fit.
+        ValueError: if there are no demonstrations, or collected episodes are another run's or damaged.
+        FileNotFoundError: if a checkpoint's counters or collected episodes are missing.
+    """
+    config, processes = student.config, PartialState()
+    require(not run.shards_weights, "--parallelism.*: AGPD collects with whole policies, so it cannot shard them; use DDP")
+    progress = Progress.restore(config, run)
+    demonstrations = DemonstrationFrames(config, dataset_meta, dataset_stats)
+    meta = demonstrations.dataset.meta
+    replay = Replay(demonstrations, config, config.replay.collected_fraction, run.image_transforms)
+    replay.seen_episodes.update(progress.seen_episodes)
+    self_teacher = _self_teacher(student, progress)
+    teacher = None if self_teacher else _teacher(config)
+    env_config = collection_environment(config.collect, run) if config.collect.enabled else None
+    check_fit(config, teacher, meta, env_config)
+    collector, journal = None, None
+    if env_config is not None:
+        _check_steps(student, teacher, demonstrations)
+        _warn_of_settings(config)
+        journal = _journal(config, run, progress, meta, env_config, seed)
+        check = partial(check_observation, meta.features)
+        rank, n_ranks = processes.process_index, processes.num_processes
+        collector = Collector(config, env_config, meta, journal, check, seed, rank, n_ranks)
+    return Parts(
+        run=run,
+        progress=progress,
+        replay=replay,
+        teacher=teacher,
+        self_teacher=self_teacher,
+        teacher_chunks=_teacher_chunks(config, teacher, replay, seed),
+        collector=collector,
+        journal=journal,
+        reports=_adopt_rounds(journal, replay, progress),
+        seed=seed,
+        rank=processes.process_index,
+    )
+
+
+# ---- teacher ----
+
+
+def _teacher(config: StudentConfig) -> Teacher | None:
+    """The teacher of `--policy.teacher.path`, if any part of the method uses one."""
+    if not (config.collect.enabled or config.needs_teacher_chunks):
+        return None
+    teacher = load_teacher(config.teacher, config.device or "cpu")
+    if config.collect.enabled and config.needs_guidance:
+        teacher.require_guidance(config.guidance.at)
+    return teacher
+
+
+def _self_teacher(student: Student, progress: Progress) -> SelfTeacher | None:
+    """Without a teacher's path, a student that can teach itself does (Table 1)."""
+    config = student.config
+    if config.teacher.path or not student.can_teach_itself:
+        return None
+    for name in ("num_inference_steps", "noise_scheduler"):
+        value = getattr(config.teacher, name)
+        require(
+            value is None,
+            f"--policy.teacher.{name}={value} has no meaning in self-distillation, where the student teaches as it "
+            "samples itself; leave it out, or give a teacher (--policy.teacher.path)",
+        )
+    require(
+        config.replay.relabel == "none",
+        f"--policy.replay.relabel={config.replay.relabel} needs a teacher (--policy.teacher.path); in "
+        "self-distillation the only one is the student",
+    )
+    require(
+        config.adversary.weight == 0 or config.collect.enabled,
+        f"--policy.adversary.weight={config.adversary.weight} needs collected episodes: in self-distillation the "
+        "adversary compares with them, and no round is to be collected; set it to 0, or --policy.collect.every above 0, "
+        "or give a teacher (--policy.teacher.path)",
+    )
+    self_teacher = SelfTeacher(student)
+    if progress.checkpoint is not None:
+        self_teacher.restore(progress.checkpoint)
+    return self_teacher
+
+
+def _teacher_chunks(
+    config: StudentConfig, teacher: Teacher | None, replay: Replay, seed: int
+) -> TeacherChunks | None:
+    if teacher is None or not config.needs_teacher_chunks:
+        return None
+    masks_padding = getattr(config, "do_mask_loss_for_padding", True)  # without that setting: always, as ACT
+    require(
+        config.replay.relabel == "none" or masks_padding or teacher.n_chunk_steps >= config.future_steps,
+        f"--policy.replay.relabel={config.replay.relabel}: the teacher predicts {teacher.n_chunk_steps} steps from the "
+        f"current one on, the student's chunk has {config.future_steps}, and its loss counts the recorded steps behind "
+        "the teacher's; pass --policy.do_mask_loss_for_padding=true, which leaves them out",
+    )
+    return TeacherChunks(teacher, replay, config.future_steps, seed)
+
+
+# ---- collection ----
+
+
+def _journal(
+    config: StudentConfig,
+    run: RunInfo,
+    progress: Progress,
+    demonstrations: LeRobotDatasetMetadata,
+    env_config: EnvConfig,
+    seed: int,
+) -> EpisodeJournal:
+    """The journal of the run's episodes; notes its folder in `progress`."""
+    root = find_replay_root(config, run, progress)
+    progress.replay_root = str(root)
+    identity = {
+        "strategy": config.collect.strategy,
+        "environment": {"type": env_config.type, "task": env_config.task},
+        "teacher": config.teacher.path,
+        "seed": seed,
+    }
+    journal = EpisodeJournal(root)
+    processes = PartialState()
+    if processes.is_main_process:
+        journal.begin(demonstrations, identity, resume=progress.checkpoint is not None)
+    processes.wait_for_everyone()
+    return journal
+
+
+def _adopt_rounds(
+    journal: EpisodeJournal | None, replay: Replay, progress: Progress
+) -> tuple[RoundReport, ...]:
+    """Take the finished rounds into T: those of the checkpoint, and those finished after it was written."""
+    if journal is None:
+        return ()
+    reports = tuple(RoundReport.from_json(report) for report in journal.reports())
+    if len(reports) < progress.rounds:
+        raise FileNotFoundError(
+            f"the checkpoint has used {progress.rounds} collection rounds, {journal.root} holds {len(reports)}; point "
+            "--policy.replay.root at the run's folder of collected episodes"
+        )
+    for report in reports:
+        replay.extend(journal.kept(report.round))
+    progress.rounds = len(reports)
+    if reports:
+        logger.info("T holds %d finished rounds of %s", len(reports), journal.root)
+    return reports
+
+
+def _check_steps(student: Student, teacher: Teacher | None, demonstrations: DemonstrationFrames) -> None:
+    """Refuse numbers of executed steps that a round, or the learned J, could not work with."""
+    n_steps, representation = executed_steps(student.config, teacher), student.representation
+    if representation is None:
+        return
+    require(
+        n_steps == representation.n_steps,
+        f"--policy.representation.type=state predicts {representation.n_steps} steps ahead, and rounds execute "
+        f"{n_steps} (the teacher's own number); set --policy.collect.n_action_steps={n_steps}",
+    )
+    longest = int(demonstrations.table.lengths.max())
+    require(
+        longest > n_steps,
+        f"--policy.representation.type=state predicts {n_steps} steps ahead, and no demonstration is longer than "
+        f"{longest}; set --policy.collect.n_action_steps below that",
+    )
+    collect = student.config.collect
+    require(
+        not (collect.strategy == "mixing" and collect.mixing.record_teacher),
+        "--policy.collect.mixing.record_teacher=true records actions that were not executed, and "
+        "--policy.representation.type=state learns what recorded actions lead to; use --policy.replay.relabel=all",
+    )
+
+
+def _warn_of_settings(config: StudentConfig) -> None:
+    """Warn of settings that are allowed and seldom intended."""
+    collect = config.collect
+    adapts = config.guidance.adaptive and config.guidance.scale > 0 and config.needs_guidance
+    if adapts and int(collect.episodes * collect.teacher_only_fraction) == 0:
+        logger.warning(
+            "--policy.collect.teacher_only_fraction=%s of --policy.collect.episodes=%d is less than one episode: the "
+            "teacher's own success rate stays unknown and the guidance scale at %s",
+            collect.teacher_only_fraction,
+            collect.episodes,
+            config.guidance.scale,
+        )
+    teacher_recorded = collect.strategy == "mixing" and collect.mixing.record_teacher
+    if collect.keep_failures and config.replay.relabel != "all" and not teacher_recorded:
+        logger.warning(
+            "--policy.collect.keep_failures=true with --policy.replay.relabel=%s: the student imitates the failures "
+            "as they were recorded; --policy.replay.relabel=all gives it the teacher's chunks there",
+            config.replay.relabel,
+        )

@@ -1,1 +1,0 @@
-"""The collection strategies, one file each."""

@@ -1,1 +1,0 @@
-"""The method: two stages, the adversary, the student mixin."""

@@ -1,0 +1,254 @@
+"""Load policies with their processors, and check that teacher, student, demonstrations and environment fit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.envs import EnvConfig
+from lerobot.envs.utils import env_to_policy_features
+from lerobot.policies import PreTrainedPolicy, get_policy_class, make_pre_post_processors
+from lerobot.processor import NormalizerProcessorStep, PolicyAction, PolicyProcessorPipeline
+from lerobot.utils.constants import ACTION, OBS_PREFIX
+from lerobot.utils.feature_utils import dataset_to_policy_features
+
+from lerobot_agpd.config import CollectConfig, FlagError, StudentConfig, TeacherConfig, require
+from lerobot_agpd.guidance.adapters import as_teacher
+from lerobot_agpd.guidance.teacher import Features, Teacher
+from lerobot_agpd.replay.normalization import Normalizer
+from lerobot_agpd.run import RunInfo
+from lerobot_agpd.student import Student, StudentSampler
+
+# ---- policies ----
+
+
+@dataclass(frozen=True)
+class LoadedPolicy:
+    """A policy in evaluation mode with the processors of its checkpoint."""
+
+    policy: PreTrainedPolicy
+    preprocessor: PolicyProcessorPipeline[dict[str, Any], dict[str, Any]]
+    postprocessor: PolicyProcessorPipeline[PolicyAction, PolicyAction]
+
+
+def read_policy_config(path: str | Path, flag: str) -> PreTrainedConfig:
+    """Configuration of the checkpoint that a flag names.
+
+    Raises:
+        FileNotFoundError: if there is no policy at the path.
+    """
+    try:
+        config = PreTrainedConfig.from_pretrained(path)
+    except Exception as error:
+        raise FileNotFoundError(
+            f"{flag}='{path}' is neither a folder with a policy's config.json nor a Hub repository that can be "
+            f"reached ({error})"
+        ) from error
+    config.pretrained_path = Path(path)
+    return config
+
+
+def load_policy(config: PreTrainedConfig) -> LoadedPolicy:
+    """Load the checkpoint at `config.pretrained_path` on `config.device`, with the settings of `config`."""
+    path = str(config.pretrained_path)
+    policy = get_policy_class(config.type).from_pretrained(path, config=config)
+    processors = make_pre_post_processors(
+        config,
+        pretrained_path=path,
+        preprocessor_overrides={"device_processor": {"device": config.device}},
+    )
+    return LoadedPolicy(policy.eval(), *processors)
+
+
+def load_teacher(config: TeacherConfig, device: str) -> Teacher:
+    """Load the teacher that `--policy.teacher.path` names, frozen.
+
+    Raises:
+        FlagError: if no path is given, or a setting has no meaning for the policy.
+        FileNotFoundError: if there is no policy at the path.
+    """
+    require(
+        bool(config.path),
+        "--policy.teacher.path is not set: AGPD distills a teacher, so name the checkpoint folder or the Hub "
+        "repository of a LeRobot policy. To clone the demonstrations alone, pass --policy.collect.every=0 "
+        "--policy.adversary.weight=0",
+    )
+    policy_config = read_policy_config(config.path, "--policy.teacher.path")
+    policy_config.device = device
+    loaded = load_policy(policy_config)
+    teacher = as_teacher(loaded.policy.requires_grad_(False), loaded.preprocessor, loaded.postprocessor)
+    teacher.set_sampler(config.num_inference_steps, config.noise_scheduler)
+    return teacher
+
+
+def load_student(config: PreTrainedConfig) -> StudentSampler:
+    """Load the distilled policy at `config.pretrained_path`.
+
+    Raises:
+        FlagError: if the policy is not a student of AGPD or its checkpoint has no normalizer.
+    """
+    loaded = load_policy(require_student(config))
+    assert isinstance(loaded.policy, Student)
+    for step in loaded.preprocessor.steps:
+        if isinstance(step, NormalizerProcessorStep) and step.stats is not None:
+            return StudentSampler(loaded.policy, Normalizer(config, step.stats))
+    raise FlagError(f"the preprocessor in --policy.path={config.pretrained_path} holds no statistics")
+
+
+def require_student(config: PreTrainedConfig | None) -> StudentConfig:
+    """Refuse a configuration that is not that of a distilled policy's checkpoint.
+
+    Raises:
+        FlagError: saying which flag is missing or wrong.
+    """
+    if config is None or not config.pretrained_path:
+        raise FlagError(
+            "--policy.path is not set: name the checkpoint folder of a policy trained with AGPD "
+            "(<output_dir>/checkpoints/last/pretrained_model)"
+        )
+    if not isinstance(config, StudentConfig):
+        raise FlagError(
+            f"--policy.path={config.pretrained_path} is a '{config.type}' policy, which has no teacher; name a "
+            "policy trained with AGPD (type 'agpd' or another distilled one)"
+        )
+    return config
+
+
+def load_pair(
+    config: PreTrainedConfig, overrides: TeacherConfig, env_config: EnvConfig
+) -> tuple[StudentSampler, Teacher]:
+    """A student and the teacher it was distilled from.
+
+    Args:
+        config: the student's, with `pretrained_path`.
+        overrides: what is set replaces the checkpoint's `teacher.*`.
+        env_config: where they are to act.
+
+    Raises:
+        FlagError: if teacher, student and environment do not fit together, or the teacher cannot be guided.
+    """
+    student_config = require_student(config)
+    chosen = {key: value for key, value in asdict(overrides).items() if value}
+    teacher = load_teacher(replace(student_config.teacher, **chosen), student_config.device or "cpu")
+    check_fit(student_config, teacher, env_config=env_config)
+    teacher.require_guidance(student_config.guidance.at)
+    return load_student(student_config), teacher
+
+
+# ---- environment ----
+
+
+def collection_environment(config: CollectConfig, run: RunInfo) -> EnvConfig:
+    """The environment to collect in: the policy's own, else the run's.
+
+    Raises:
+        FlagError: if there is neither.
+    """
+    env_config = config.env or run.env
+    if env_config is None:
+        raise FlagError(
+            "collection needs an environment: pass --env.type=... (also used for evaluation) or "
+            "--policy.collect.env.type=...; to train without collection pass --policy.collect.every=0"
+        )
+    return env_config
+
+
+# ---- what must fit together ----
+
+
+def check_fit(
+    student: StudentConfig,
+    teacher: Teacher | None = None,
+    demonstrations: LeRobotDatasetMetadata | None = None,
+    env_config: EnvConfig | None = None,
+) -> None:
+    """Refuse a teacher, demonstrations or an environment that do not belong together; what is None is not checked.
+
+    Raises:
+        FlagError: naming both sides and what differs.
+    """
+    if env_config is not None:
+        _check_environment(student, teacher, env_config)
+        if demonstrations is not None:
+            require(
+                env_config.fps == demonstrations.fps,
+                f"the demonstrations (--dataset.*) were recorded at {demonstrations.fps} frames per second, the "
+                f"environment '{env_config.type}' (--env.fps) runs at {env_config.fps}: T would mix two time scales",
+            )
+    if teacher is None:
+        return
+    if demonstrations is not None:
+        _check_observations(teacher, "the demonstrations (--dataset.*)", demonstrated_features(demonstrations))
+    elif env_config is not None:
+        _check_observations(
+            teacher, f"the environment '{env_config.type}' (--env.*)", env_to_policy_features(env_config)
+        )
+    needed, given = (tuple(feature.shape) for feature in (teacher.action_feature, _action(student)))
+    require(
+        needed == given,
+        f"--policy.teacher.path: the teacher's actions have shape {needed}, the student's {given}; choose a teacher of "
+        "the same action space",
+    )
+
+
+def demonstrated_features(dataset_meta: LeRobotDatasetMetadata) -> Features:
+    """Observation features that the demonstrations hold."""
+    features = dataset_to_policy_features(dataset_meta.features)
+    return {key: feature for key, feature in features.items() if key.startswith(OBS_PREFIX)}
+
+
+def _action(student: StudentConfig) -> PolicyFeature:
+    assert student.action_feature is not None
+    return student.action_feature
+
+
+def _check_environment(student: StudentConfig, teacher: Teacher | None, env_config: EnvConfig) -> None:
+    """Refuse an environment that does not deliver what student and teacher observe, or takes other actions."""
+    delivered = env_to_policy_features(env_config)
+    observers: dict[str, Features] = {"student": student.input_features or {}}
+    if teacher is not None:
+        observers["teacher"] = teacher.input_features
+    for observer, needed in observers.items():
+        missing = sorted(set(needed) - set(delivered))
+        require(
+            not missing,
+            f"the {observer} observes {sorted(needed)}, the environment '{env_config.type}' delivers "
+            f"{sorted(set(delivered) - {ACTION})}: {missing} is missing (check --env.obs_type and --dataset.*)",
+        )
+    for key, feature in {**observers["student"], ACTION: _action(student)}.items():
+        # Images are left out: environments declare sizes that they do not always deliver.
+        demonstrated, given = tuple(feature.shape), tuple(delivered[key].shape)
+        require(
+            feature.type is FeatureType.VISUAL or demonstrated == given,
+            f"'{key}' has shape {demonstrated} in the demonstrations (--dataset.*) and {given} in the environment "
+            f"'{env_config.type}' (--env.*, task {env_config.task})",
+        )
+
+
+def _check_observations(teacher: Teacher, source: str, available: Features) -> None:
+    """Refuse a teacher whose observations a source does not deliver."""
+    differing = sorted(
+        key
+        for key, feature in teacher.input_features.items()
+        if key not in available or not _serves(teacher, feature, available[key])
+    )
+    require(
+        not differing,
+        f"the teacher (--policy.teacher.path) needs the observations {_shapes(teacher.input_features)}, {source} "
+        f"has {_shapes(available)}; they differ in {differing}",
+    )
+
+
+def _serves(teacher: Teacher, needed: PolicyFeature, given: PolicyFeature) -> bool:
+    """Whether a feature is what the teacher needs: of the same shape, or an image that it resizes."""
+    if needed.type is FeatureType.VISUAL and teacher.resizes_images:
+        return given.type is FeatureType.VISUAL and needed.shape[0] == given.shape[0]  # channels
+    return tuple(needed.shape) == tuple(given.shape)
+
+
+def _shapes(features: Mapping[str, PolicyFeature]) -> dict[str, tuple[int, ...]]:
+    return {key: tuple(feature.shape) for key, feature in features.items()}

@@ -1,0 +1,184 @@
+"""The hooks of LeRobot's training loop for every student of AGPD."""
+
+import logging
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import torch
+from accelerate import PartialState
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.utils.random_utils import seeded_context
+from torch import Tensor, nn
+
+from lerobot_agpd.adversary import Discriminator
+from lerobot_agpd.agpd import AGPD
+from lerobot_agpd.build import build_parts
+from lerobot_agpd.config import StudentConfig, require
+from lerobot_agpd.guidance.representation import LR, StateRepresentation
+from lerobot_agpd.policies.gradient_norms import GradientNorms
+from lerobot_agpd.replay.demonstrations import delivers_single_frames
+from lerobot_agpd.replay.export import merge
+from lerobot_agpd.replay.normalization import Statistics
+from lerobot_agpd.run import RunInfo
+from lerobot_agpd.student import Student
+from lerobot_agpd.weights import require_weights
+
+logger = logging.getLogger(__name__)
+
+
+class DistilledPolicy(Student):
+    """Mixin: a policy trained by AGPD in LeRobot's own training loop.
+
+    In eval mode it is the policy it is mixed into, and it loads without teacher, dataset or environment. A
+    concrete class names this mixin before LeRobot's policy and implements the abstract parts of `Student`.
+    """
+
+    discriminator: Discriminator | None
+    optional_weights: tuple[str, ...] = ("discriminator", "representation")
+    """Parts that a checkpoint may lack: a student may be started with an adversary that it was saved without."""
+
+    def init_distillation(
+        self,
+        dataset_meta: LeRobotDatasetMetadata | None,
+        dataset_stats: Statistics | None,
+        run: RunInfo | None,
+    ) -> None:
+        """Add discriminator and representation; in a training run, load and check everything else now.
+
+        Args:
+            dataset_meta: metadata of the demonstrations; without it the policy can be evaluated but not trained.
+            dataset_stats: their statistics.
+            run: the training run; default: the one that is building this policy. Without any, what trains the policy is
+                built at the first training step.
+        """
+        config = self.config
+        assert config.action_feature is not None
+        action_dim = config.action_feature.shape[0]
+        self.discriminator = None
+        if config.adversary.weight > 0:
+            self.discriminator = Discriminator(config.future_steps, action_dim, self.embedding_dim)
+        self.representation = None
+        if config.representation.type == "state":
+            n_steps = config.collect.n_action_steps or config.n_execute
+            self.representation = StateRepresentation(vector_dim(config), action_dim, n_steps)
+        self._gradient_norms = GradientNorms(self.parameter_groups())
+        run = run or RunInfo.of(config)
+        self._training_data = (dataset_meta, dataset_stats, run or RunInfo())
+        self._agpd: AGPD | None = None
+        if run is not None and dataset_meta is not None:
+            self.agpd  # noqa: B018  # wrong input ends the run here, before training starts
+
+    @property
+    def agpd(self) -> AGPD:
+        """What trains this student."""
+        if self._agpd is None:
+            seed = torch.initial_seed() % 2**32
+            with seeded_context(seed):  # loading a teacher draws numbers, which a resumed run must not notice
+                self._agpd = AGPD(self, build_parts(self, *self._training_data, seed=seed))
+        return self._agpd
+
+    # ---- LeRobot's training loop ----
+
+    def forward(self, batch: dict[str, Any], **kwargs: Any) -> tuple[Tensor, dict[str, Any]]:
+        """L_IL on a batch of T, plus AGPD's own losses in training mode.
+
+        Batches of single frames (what `lerobot-train` delivers) are completed from memory; batches that hold
+        chunks (B, S, A) are used as they are, without replay or adversary.
+        """
+        if not delivers_single_frames(batch):
+            return super().forward(batch, **kwargs)
+        agpd = self.agpd
+        if not self.training:
+            return super().forward(agpd.eval_batch(batch), **kwargs)
+        batch = agpd.train_batch(batch)
+        loss, log = super().forward(batch, **kwargs)
+        reference = agpd.adversary_batch(batch)
+        prior = self.prior_chunk(reference.batch) if reference and len(reference.chunk) else None
+        losses = agpd.losses(batch, reference, prior, self.discriminator)
+        norms = self._gradient_norms.pop()
+        return loss + losses.total, {"imitation_loss": loss.item(), **(log or {}), **losses.log, **norms}
+
+    def update(self) -> None:
+        """Advance the alternation; LeRobot calls this after every optimizer step, on every process."""
+        if hasattr(super(), "update"):
+            super().update()  # type: ignore[misc]
+        if self._agpd is not None and self._agpd.after_update():
+            self._merge_episodes()
+
+    def _merge_episodes(self) -> None:
+        """Merge all kept episodes into one dataset and upload it if requested.
+
+        A failure is logged: LeRobot has yet to write the last checkpoint, and the journal is complete as it is.
+        """
+        journal, collect = self.agpd.journal, self.config.collect
+        if journal is None or not PartialState().is_main_process:
+            return
+        try:
+            merged = merge(journal.root, collect.repo_id)
+            if merged is not None and collect.push_to_hub:
+                merged.push_to_hub()
+        except Exception:
+            upload = f" --repo_id={collect.repo_id} --push_to_hub=true" if collect.push_to_hub else ""
+            logger.exception(
+                "the collected episodes could not be merged or uploaded; they are complete in %s. Once the cause is "
+                "gone, run lerobot-agpd-merge --root=%s%s",
+                journal.root,
+                journal.root,
+                upload,
+            )
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Trainable parameters of student, discriminator and representation."""
+        groups: dict[str, list[nn.Parameter]] = {"student": [], "discriminator": [], "representation": []}
+        for name, parameter in self.named_parameters():
+            owner = name.split(".", 1)[0]
+            if parameter.requires_grad:
+                groups[owner if owner in groups else "student"].append(parameter)
+        return groups
+
+    def get_optim_params(self) -> list[dict[str, Any]]:
+        """The student's own groups, then one each for discriminator and representation if there are any."""
+        groups = self.parameter_groups()
+        own = {id(parameter) for parameter in groups["student"]}
+        params = [
+            {**group, "params": [p for p in group["params"] if id(p) in own]}
+            for group in _as_groups(super().get_optim_params())  # type: ignore[misc]
+        ]
+        for name, lr in (("discriminator", self.config.adversary.lr), ("representation", LR)):
+            if groups[name]:
+                params.append({"params": groups[name], "lr": lr})
+        return params
+
+    # ---- checkpoints ----
+
+    def _save_pretrained(self, save_directory: Path, **kwargs: Any) -> None:
+        super()._save_pretrained(save_directory, **kwargs)  # type: ignore[misc]
+        if self._agpd is not None and PartialState().is_main_process:
+            self._agpd.save(save_directory)
+
+    @classmethod
+    def _load_as_safetensor(cls, model: Any, model_file: str, map_location: str, strict: bool) -> Any:
+        require_weights(model, model_file, optional=cls.optional_weights)
+        return super()._load_as_safetensor(model, model_file, map_location, strict)  # type: ignore[misc]
+
+
+def vector_dim(config: StudentConfig) -> int:
+    """Size D of all low-dimensional observations side by side.
+
+    Raises:
+        FlagError: if there are none.
+    """
+    features = config.input_features or {}
+    require(
+        bool(config.observed_vectors),
+        "--policy.representation.type=state predicts low-dimensional observations, but the inputs are "
+        f"{list(features)}; use --policy.representation.type=action",
+    )
+    return sum(features[key].shape[0] for key in config.observed_vectors)
+
+
+def _as_groups(params: Iterable[Any]) -> list[dict[str, Any]]:
+    """Optimizer parameters as a list of groups."""
+    entries = list(params)
+    return entries if entries and isinstance(entries[0], dict) else [{"params": entries}]

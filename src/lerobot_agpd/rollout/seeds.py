@@ -1,0 +1,102 @@
+"""Seeds of collection: reproducible per process and round, disjoint from evaluation's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from lerobot_agpd.config import COLLECTION_SEEDS
+from lerobot_agpd.replay.episode import EpisodeRecord, EpisodeSpec
+
+TEACHER_NOISE_STREAM = 1
+"""Random numbers of a round: the teacher's sampling noise, ..."""
+
+STUDENT_NOISE_STREAM = 2
+"""... the noise that students draw from torch's own generator, ..."""
+
+DIAGNOSTICS_STREAM = 3
+"""... and those of the diagnostics."""
+
+EPISODE_STREAM = 1
+"""What varies an episode, beside what the environment draws from the same seed."""
+
+ROLLIN_FRACTION = 0.5
+"""strategy=rollin: the student's part is drawn up to this fraction of the longest possible episode."""
+
+
+def stream_seed(seed: int, rank: int, round_number: int, stream: int) -> int:
+    """Seed of one stream of random numbers of a process in a round; streams are independent of each other."""
+    state = np.random.SeedSequence([seed, rank, round_number, stream]).generate_state(1, np.uint32)
+    return int(state[0])
+
+
+def rank_part(n_episodes: int, rank: int, n_ranks: int) -> int:
+    """How many of a round's episodes a process collects."""
+    return n_episodes // n_ranks + (rank < n_episodes % n_ranks)
+
+
+def episode_specs(
+    n_episodes: int,
+    seed: int,
+    rank: int,
+    n_ranks: int,
+    round_number: int,
+    strength: float,
+    teacher_only_fraction: float,
+    student_begins: bool = False,
+    retries: Sequence[int] = (),
+) -> list[EpisodeSpec]:
+    """The episodes of a round that one process collects.
+
+    Environment seeds come from SeedSequence([seed, rank, round]); teacher-only episodes are spread evenly over the
+    round, whatever the number of processes. What else differs between episodes comes from their own seeds.
+
+    Args:
+        n_episodes: of the round, over all processes.
+        seed: of the run.
+        rank: of this process.
+        n_ranks: number of processes.
+        round_number: of the round.
+        strength: guidance scale, or mixing weight.
+        teacher_only_fraction: fraction of the episodes whose strength is 0.
+        student_begins: whether the student acts for a first part of every episode.
+        retries: environment seeds from which episodes start again. They take the places of the first ones that are
+            not the teacher's alone; every round varies them anew.
+    """
+    first = sum(rank_part(n_episodes, lower, n_ranks) for lower in range(rank))
+    n_episodes = rank_part(n_episodes, rank, n_ranks)
+    rng = np.random.default_rng(np.random.SeedSequence([seed, rank, round_number]))
+    seeds = rng.integers(*COLLECTION_SEEDS, size=n_episodes)
+    positions = first + np.arange(n_episodes + 1)
+    teacher_only = np.diff(np.floor(positions * teacher_only_fraction + 1e-9)) > 0
+    waiting = iter(retries)
+    specs = []
+    for number, (fresh, alone) in enumerate(zip(seeds, teacher_only, strict=True)):
+        again = None if alone else next(waiting, None)
+        env_seed = int(fresh) if again is None else again
+        own = np.random.default_rng([env_seed, EPISODE_STREAM, *([] if again is None else [round_number])])
+        own.uniform()  # keeps the numbers that follow where they were when episodes also varied their strength
+        fraction = ROLLIN_FRACTION * own.uniform() if student_begins else 0.0
+        specs.append(
+            EpisodeSpec(number, env_seed, 0.0 if alone else strength, float(fraction), again is not None)
+        )
+    return specs
+
+
+def failed_starts(records: Iterable[EpisodeRecord]) -> list[int]:
+    """Environment seeds from which no episode has succeeded, the least often tried first.
+
+    A filter on success thins out the starts at which the teacher fails, and with them what the student is taught
+    about them; trying these again brings them back.
+
+    Args:
+        records: of every episode of the finished rounds.
+    """
+    attempts: dict[int, int] = {}
+    solved = set()
+    for record in records:
+        attempts[record.seed] = attempts.get(record.seed, 0) + 1
+        if record.success or record.solved_at_start:
+            solved.add(record.seed)
+    return sorted((seed for seed in attempts if seed not in solved), key=lambda seed: attempts[seed])
