@@ -8,7 +8,7 @@ import draccus
 
 from lerobot_agpd.cli.command import command
 from lerobot_agpd.guidance.config import require
-from lerobot_agpd.replay.store import ReplayStore
+from lerobot_agpd.replay.export import merge
 
 logger = logging.getLogger(__name__)
 
@@ -17,9 +17,12 @@ logger = logging.getLogger(__name__)
 class MergeConfig:
     """Options of `lerobot-agpd-merge`; a run that reaches its last step merges by itself."""
 
-    root: Path  # folder of a run's collected episodes, <output_dir>/agpd
-    repo_id: str | None = None  # name of the merged dataset, and its Hub repository; default: after the run
-    push_to_hub: bool = False  # upload it
+    # folder of a run's collected episodes, <output_dir>/agpd; the run may still be going
+    root: Path
+    # name of the merged dataset, and its Hub repository; default: after the run
+    repo_id: str | None = None
+    # upload it
+    push_to_hub: bool = False
 
     def __post_init__(self) -> None:
         require(self.root.is_dir(), f"--root={self.root} is not a folder")
@@ -28,8 +31,8 @@ class MergeConfig:
 
 @draccus.wrap()
 def run(config: MergeConfig) -> None:
-    """Merge all finished rounds, and upload."""
-    merged = ReplayStore(config.root).merge(config.repo_id)
+    """Merge all kept episodes, and upload."""
+    merged = merge(config.root, config.repo_id)
     require(merged is not None, f"--root={config.root} holds no kept episode")
     assert merged is not None
     logger.info("%d episodes, %d frames in %s", merged.num_episodes, merged.num_frames, merged.root)

@@ -16,7 +16,7 @@ from lerobot_agpd.policies.diffusion_transformer.modeling_diffusion_transformer 
     DiffusionTransformerPolicy,
 )
 from lerobot_agpd.policies.diffusion_transformer.transformer import TransformerDenoiser
-from lerobot_agpd.replay.normalisation import Statistics
+from lerobot_agpd.replay.normalization import Statistics
 
 
 class EncoderTokens(nn.Module):

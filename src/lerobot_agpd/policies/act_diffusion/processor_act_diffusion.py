@@ -10,7 +10,7 @@ from lerobot_agpd.policies.act_diffusion.configuration_act_diffusion import ACTD
 from lerobot_agpd.policies.diffusion_transformer.processor_diffusion_transformer import (
     make_diffusion_transformer_pre_post_processors,
 )
-from lerobot_agpd.replay.normalisation import Statistics
+from lerobot_agpd.replay.normalization import Statistics
 
 
 def make_act_diffusion_pre_post_processors(

@@ -56,6 +56,16 @@ class AGPDConfig(DistilledConfig, ACTConfig):
         return list(range(self.chunk_size))
 
     @property
+    def chunk_delta_indices(self) -> list[int]:
+        """Steps of a chunk relative to the current one."""
+        return self.chunk_offsets
+
+    @property
+    def history_length(self) -> None:
+        """None: ACT looks at the current observation alone, without a time dimension."""
+        return None
+
+    @property
     def observation_history(self) -> None:
         """None: ACT looks at the current observation alone, without a time dimension."""
         return None

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lerobot_agpd.distill.student import DistilledStudent
 from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig
-from lerobot_agpd.replay.normalisation import Statistics
+from lerobot_agpd.replay.normalization import Statistics
 
 
 class AGPDPolicy(DistilledStudent, ACTPolicy):

@@ -8,7 +8,7 @@ from lerobot.policies.act.processor_act import make_act_pre_post_processors
 from lerobot.processor import PolicyAction, PolicyProcessorPipeline
 
 from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig
-from lerobot_agpd.replay.normalisation import Statistics, floor_statistics
+from lerobot_agpd.replay.normalization import Statistics, floor_statistics
 
 
 def make_agpd_pre_post_processors(

@@ -39,6 +39,11 @@ class AGPDDiffusionConfig(DistilledConfig, DiffusionTransformerConfig):
         return self.n_action_steps
 
     @property
+    def history_length(self) -> int:
+        """Steps of an observation."""
+        return self.n_obs_steps
+
+    @property
     def observation_history(self) -> int:
         """Steps of an observation."""
         return self.n_obs_steps

@@ -15,7 +15,7 @@ from lerobot_agpd.policies.diffusion_transformer.model import condition_dim
 from lerobot_agpd.policies.diffusion_transformer.modeling_diffusion_transformer import (
     DiffusionTransformerPolicy,
 )
-from lerobot_agpd.replay.normalisation import Statistics
+from lerobot_agpd.replay.normalization import Statistics
 
 
 class AGPDDiffusionPolicy(DistilledStudent, DiffusionTransformerPolicy):

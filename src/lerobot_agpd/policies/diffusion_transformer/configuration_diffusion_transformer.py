@@ -194,3 +194,8 @@ class DiffusionTransformerConfig(DiffusionConfig):
     def chunk_offsets(self) -> list[int]:
         """Steps of a chunk relative to the current one."""
         return super().action_delta_indices
+
+    @property
+    def chunk_delta_indices(self) -> list[int]:
+        """Steps of a chunk relative to the current one."""
+        return self.chunk_offsets

@@ -20,8 +20,8 @@ from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transfo
 )
 from lerobot_agpd.policies.diffusion_transformer.model import DenoisingModel
 from lerobot_agpd.policies.diffusion_transformer.transformer import weight_decay_groups
-from lerobot_agpd.replay.memory import FrameMemory, delivers_single_frames, gather_rows
-from lerobot_agpd.replay.normalisation import Statistics
+from lerobot_agpd.replay.demonstrations import DemonstrationFrames, delivers_single_frames
+from lerobot_agpd.replay.normalization import Statistics
 from lerobot_agpd.run import this_run
 from lerobot_agpd.weights import require_weights
 
@@ -59,7 +59,7 @@ class DiffusionTransformerPolicy(DiffusionPolicy):
         self.diffusion = self.model_class(config)
         self.reset()
         self._dataset = (dataset_meta, dataset_stats)
-        self._memory: FrameMemory | None = None
+        self._memory: DemonstrationFrames | None = None
         self._ema: EMAModel | None = None
         self._ema_is_active = False
 
@@ -85,11 +85,10 @@ class DiffusionTransformerPolicy(DiffusionPolicy):
 
     def _gather(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         if self._memory is None:
-            self._memory = FrameMemory(self.config, *self._dataset)
+            self._memory = DemonstrationFrames(self.config, *self._dataset)
         self._memory.observe(batch)
-        offsets = torch.as_tensor(self.config.chunk_offsets)
-        return gather_rows(
-            self._memory.normalised, batch["index"], self.config, offsets, self.config.n_obs_steps
+        return self._memory.gather_batch(
+            batch["index"], self.config.chunk_delta_indices, self.config.n_obs_steps
         )
 
     def update(self) -> None:

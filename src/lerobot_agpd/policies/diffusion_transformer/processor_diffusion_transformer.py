@@ -10,7 +10,7 @@ from lerobot.processor import PolicyAction, PolicyProcessorPipeline
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
     DiffusionTransformerConfig,
 )
-from lerobot_agpd.replay.normalisation import Statistics, floor_statistics
+from lerobot_agpd.replay.normalization import Statistics, floor_statistics
 
 
 def make_diffusion_transformer_pre_post_processors(

@@ -1,4 +1,4 @@
-"""Normalisation of gathered rows with the very statistics that the training loop's preprocessor uses."""
+"""Normalization of gathered frames with the very statistics that the training loop's preprocessor uses."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ logger = logging.getLogger(__name__)
 Statistics = Mapping[str, Mapping[str, Any]]
 
 STD_FLOOR = 1e-3
-"""Smallest standard deviation (and half of the smallest min-max range) a normaliser divides by, in the
+"""Smallest standard deviation (and half of the smallest min-max range) a normalizer divides by, in the
 feature's own unit. LeRobot's own floor of 1e-8 turns rounding errors of constant features into huge inputs."""
 
 
 def floor_statistics(stats: Statistics, floor: float = STD_FLOOR) -> dict[str, dict[str, Any]]:
     """Copy of dataset statistics whose spread never falls below a floor.
 
-    A feature that hardly varies is centred as before and divided by `floor` (MEAN_STD), or its range is
-    widened to 2 * floor around its centre (MIN_MAX).
+    A feature that hardly varies is centered as before and divided by `floor` (MEAN_STD), or its range is
+    widened to 2 * floor around its center (MIN_MAX).
     """
     floored = {key: dict(deepcopy(entry)) for key, entry in stats.items()}
     for entry in floored.values():
@@ -42,27 +42,27 @@ def floor_statistics(stats: Statistics, floor: float = STD_FLOOR) -> dict[str, d
     return floored
 
 
-class Normaliser:
-    """LeRobot's normaliser and unnormaliser for one set of statistics, usable on single features."""
+class Normalizer:
+    """LeRobot's normalizer and unnormalizer for one set of statistics, usable on single features."""
 
     def __init__(self, config: PreTrainedConfig, stats: Statistics):
-        """Normalise the features of `config` in the way its `normalization_mapping` says."""
+        """Normalize the features of `config` in the way its `normalization_mapping` says."""
         self.stats = stats
         arguments: dict[str, Any] = {
             "features": {**(config.input_features or {}), **(config.output_features or {})},
             "norm_map": config.normalization_mapping,
             "stats": {key: dict(entry) for key, entry in stats.items()},
         }
-        self._normalise = NormalizerProcessorStep(**arguments)
-        self._unnormalise = UnnormalizerProcessorStep(**arguments)
+        self._normalize = NormalizerProcessorStep(**arguments)
+        self._unnormalize = UnnormalizerProcessorStep(**arguments)
 
-    def normalise(self, key: str, values: Tensor) -> Tensor:
+    def normalize(self, key: str, values: Tensor) -> Tensor:
         """Map values (..., D) of a feature from its own units to the policy's."""
-        return self._apply(self._normalise, key, values)
+        return self._apply(self._normalize, key, values)
 
-    def unnormalise(self, key: str, values: Tensor) -> Tensor:
+    def unnormalize(self, key: str, values: Tensor) -> Tensor:
         """Map values (..., D) of a feature from the policy's units back to its own."""
-        return self._apply(self._unnormalise, key, values)
+        return self._apply(self._unnormalize, key, values)
 
     @staticmethod
     def _apply(step: Any, key: str, values: Tensor) -> Tensor:
@@ -72,7 +72,7 @@ class Normaliser:
 
 
 def saved_statistics(pretrained_path: Path | str, config: PreTrainedConfig) -> Statistics | None:
-    """Statistics stored with a checkpoint's preprocessor, or None where it has no normaliser."""
+    """Statistics stored with a checkpoint's preprocessor, or None where it has no normalizer."""
     preprocessor, _ = make_pre_post_processors(
         config,
         pretrained_path=str(pretrained_path),
@@ -84,23 +84,23 @@ def saved_statistics(pretrained_path: Path | str, config: PreTrainedConfig) -> S
     return None
 
 
-def matching_normaliser(
+def matching_normalizer(
     config: PreTrainedConfig,
     candidates: Sequence[tuple[str, Statistics]],
     raw: Mapping[str, Tensor],
     delivered: Mapping[str, Tensor],
     tolerance: float = 1e-3,
-) -> Normaliser:
+) -> Normalizer:
     """The candidate statistics that turn `raw` frames into the ones the training loop `delivered`.
 
     LeRobot keeps a checkpoint's statistics when a run is resumed and replaces them with the dataset's when a
-    policy is only started from it; the policy is told neither. Rather than guess, ask the data.
+    policy is only started from it, and tells the policy neither. The data show which ones are in use.
 
     Args:
-        config: features and normalisation modes.
+        config: features and normalization modes.
         candidates: named statistics, most likely first.
-        raw: unnormalised frames, (B, D) per feature.
-        delivered: the same frames as the loop's preprocessor normalised them.
+        raw: raw frames (B, D) per feature.
+        delivered: the same frames as the loop's preprocessor normalized them.
         tolerance: largest difference, relative to max(1, |value|).
 
     Raises:
@@ -108,16 +108,16 @@ def matching_normaliser(
     """
     errors = {}
     for name, stats in candidates:
-        normaliser = Normaliser(config, stats)
+        normalizer = Normalizer(config, stats)
         errors[name] = {
-            key: _relative_error(normaliser.normalise(key, raw[key]), delivered[key]) for key in raw
+            key: _relative_error(normalizer.normalize(key, raw[key]), delivered[key]) for key in raw
         }
         if max(errors[name].values()) <= tolerance:
-            logger.info("gathered rows are normalised with the %s statistics", name)
-            return normaliser
+            logger.info("gathered frames are normalized with the %s statistics", name)
+            return normalizer
     raise ValueError(
-        "no known statistics reproduce the normalised frames that the training loop delivers; largest "
-        f"relative errors: {errors}. Does a processor step other than normalisation change low-dimensional "
+        "no known statistics reproduce the normalized frames that the training loop delivers; largest "
+        f"relative errors: {errors}. Does a processor step other than normalization change low-dimensional "
         "features? Then train with frames delivered by LeRobot's loader instead of gathered ones."
     )
 

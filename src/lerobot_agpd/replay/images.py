@@ -1,0 +1,64 @@
+"""Camera frames and tasks of T, read where they were recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from torch import Tensor
+
+from lerobot_agpd.replay.frames import FrameTable
+from lerobot_agpd.replay.stored import StoredEpisode
+
+
+class RecordedFrames:
+    """What the frames of T hold beside their columns.
+
+    Args:
+        dataset: the demonstrations, the first episodes of T.
+        table: the columns of T, which grow.
+    """
+
+    def __init__(self, dataset: LeRobotDataset, table: FrameTable):
+        self.dataset = dataset
+        self.table = table
+        self.n_demonstration_frames = len(table)
+        self._n_demonstrations = len(table.lengths)
+        self._tasks = _tasks(dataset)
+        self._collected: list[StoredEpisode] = []
+
+    def append(self, episode: StoredEpisode) -> None:
+        """Add a collected episode, whose columns the table has."""
+        self._collected.append(episode)
+
+    def images(self, frame_index: Tensor, keys: Sequence[str]) -> dict[str, Tensor]:
+        """Cameras' frames (B, C, H, W) in [0, 1]; each distinct frame is read once."""
+        distinct, position = frame_index.cpu().unique(return_inverse=True)
+        read = [self._read(index, keys) for index in distinct.tolist()]
+        return {key: torch.stack([frames[key] for frames in read])[position] for key in keys}
+
+    def _read(self, index: int, keys: Sequence[str]) -> dict[str, Tensor]:
+        if index < self.n_demonstration_frames:
+            item = self.dataset[index]
+            return {key: item[key] for key in keys}
+        episode, step = self._locate(index)
+        frames = {key: torch.from_numpy(episode.frame(key, step)) for key in keys}
+        return {key: frame.permute(2, 0, 1).float() / 255 for key, frame in frames.items()}
+
+    def task(self, index: int) -> str:
+        """The task of a frame's episode."""
+        if index < self.n_demonstration_frames:
+            return self._tasks[index]
+        return self._locate(index)[0].task
+
+    def _locate(self, index: int) -> tuple[StoredEpisode, int]:
+        frame = torch.tensor([index])
+        number, (start, _) = int(self.table.episode(frame)), self.table.episode_bounds(frame)
+        return self._collected[number - self._n_demonstrations], index - int(start)
+
+
+def _tasks(dataset: LeRobotDataset) -> list[str]:
+    """The task of every frame."""
+    names = {int(index): str(name) for name, index in dataset.meta.tasks["task_index"].items()}
+    return [names[int(index)] for index in dataset.hf_dataset.with_format("numpy")["task_index"][:]]

@@ -1,0 +1,223 @@
+"""Collected episodes on disk: every kept episode is written once and read from there.
+
+    <root>/
+        journal.json                              the demonstrations' features, and the run the episodes belong to
+        round-00000/rank-0.jsonl                  index: one record per generated episode, in the order of their ends
+        round-00000/rank-0-000012.npy             vectors of kept episode 12, one row per step
+        round-00000/rank-0-000012.<camera>.npy    its frames of a camera, (T, H, W, C) uint8
+        round-00000/report.json                   written last: its presence makes the round a finished one
+        merged/                                   all kept episodes as a LeRobotDataset, see `export.py`
+
+Files are complete once they have their name: they are written under another one, synced and renamed. An episode's
+frames are on disk before its record is, so a process may be killed at any point and loses at most the episodes that
+were running. Reading changes nothing, so another process may read while a run collects.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+from lerobot_agpd.replay.episode import Episode, EpisodeRecord
+from lerobot_agpd.replay.files import append_line, complete_lines, read_json, write_array, write_json
+from lerobot_agpd.replay.stored import StoredEpisode, camera_path, split_columns
+
+logger = logging.getLogger(__name__)
+
+HEADER = "journal.json"
+REPORT = "report.json"
+
+
+class EpisodeJournal:
+    """The collected episodes of a run under one root folder; any number of processes may append."""
+
+    def __init__(self, root: Path):
+        """Use `root`, which `begin` creates."""
+        self.root = root
+        self._header: dict[str, Any] | None = None
+
+    # ---- the run ----
+
+    @property
+    def exists(self) -> bool:
+        """Whether the journal was begun."""
+        return (self.root / HEADER).exists()
+
+    @property
+    def header(self) -> dict[str, Any]:
+        """The demonstrations' `fps`, `robot_type`, `features` and `task`, and the run's `identity`.
+
+        Raises:
+            ValueError: if the file is missing or damaged.
+        """
+        if self._header is None:
+            path = self.root / HEADER
+            if not path.exists():
+                raise ValueError(f"{path} is missing: {self.root} is no folder of collected episodes")
+            self._header = read_json(path, "restore it, or start a new run with another --policy.replay.root")
+        return self._header
+
+    def begin(
+        self,
+        demonstrations: LeRobotDatasetMetadata,
+        identity: Mapping[str, Any],
+        resume: bool = False,
+    ) -> None:
+        """Write down what the episodes have in common, or check that this is the run they belong to.
+
+        One process calls it before any process appends.
+
+        Args:
+            demonstrations: metadata of the demonstrations, whose features a merged dataset takes over.
+            identity: what the run's episodes depend on, such as the teacher and the environment.
+            resume: whether the run continues a checkpoint, whose episodes are its own whatever has changed.
+
+        Raises:
+            ValueError: if the folder holds episodes of another run.
+        """
+        if not self.exists:
+            features = demonstrations.features
+            content = {"fps": demonstrations.fps, "robot_type": demonstrations.robot_type}
+            content |= {"task": str(demonstrations.tasks.index[0]), "features": features}
+            write_json(self.root / HEADER, {**content, "identity": dict(identity)})
+        if not resume:
+            self._check_identity(json.loads(json.dumps(identity)))
+
+    def _check_identity(self, identity: Mapping[str, Any]) -> None:
+        recorded = self.header["identity"]
+        differing = [
+            f"{key} {recorded.get(key)!r} instead of {identity.get(key)!r}"
+            for key in sorted({*recorded, *identity})
+            if recorded.get(key) != identity.get(key)
+        ]
+        if differing:
+            raise ValueError(
+                f"{self.root} holds the episodes of another run ({'; '.join(differing)}); pass another "
+                "--policy.replay.root, or continue that run with --resume=true"
+            )
+
+    # ---- writing ----
+
+    def append(self, round_number: int, rank: int, episode: Episode, record: EpisodeRecord) -> None:
+        """Write an episode of a round: its frames if it is kept, then its record."""
+        folder = self._folder(round_number)
+        folder.mkdir(parents=True, exist_ok=True)
+        vectors, images = split_columns(episode.columns)
+        if record.kept:
+            path = _frames_path(folder, rank, record.number)
+            write_array(path, vectors)
+            for key, values in images.items():
+                write_array(camera_path(path, key), values)
+        entry = {**record.to_json(), "task": episode.task, "cameras": sorted(images)}
+        append_line(_index_path(folder, rank), json.dumps(entry))
+
+    def finish(self, round_number: int, report: Mapping[str, Any]) -> None:
+        """Make a round a finished one; called by one process after all have written their episodes."""
+        write_json(self._folder(round_number) / REPORT, report)
+
+    # ---- reading ----
+
+    def records(self, round_number: int, rank: int | None = None) -> list[EpisodeRecord]:
+        """Records of a round's episodes, of one process or of all, ordered by rank and number.
+
+        Raises:
+            ValueError: if an index is damaged.
+        """
+        entries = self._entries(round_number)
+        return [_record(entry) for owner, entry in entries if rank is None or owner == rank]
+
+    def kept(self, round_number: int) -> list[StoredEpisode]:
+        """The kept episodes of a round, of all processes, ordered by rank and number.
+
+        Raises:
+            ValueError: if an index is damaged.
+        """
+        folder = self._folder(round_number)
+        return [
+            StoredEpisode(
+                record=_record(entry),
+                task=entry["task"] or self.header["task"],
+                path=_frames_path(folder, rank, entry["number"]),
+                cameras=tuple(entry["cameras"]),
+            )
+            for rank, entry in self._entries(round_number)
+            if entry["kept"]
+        ]
+
+    def stored(self) -> Iterator[tuple[int, StoredEpisode]]:
+        """All kept episodes with their rounds, those of an unfinished round too."""
+        for round_number in self._rounds():
+            for episode in self.kept(round_number):
+                yield round_number, episode
+
+    def reports(self) -> list[dict[str, Any]]:
+        """Reports of the finished rounds, in order.
+
+        Raises:
+            ValueError: if a round before the last finished one is not finished, or a report is damaged.
+        """
+        finished = [number for number in self._rounds() if (self._folder(number) / REPORT).exists()]
+        missing = set(range(len(finished))) - set(finished)
+        if missing:
+            raise ValueError(
+                f"{self._folder(min(missing))} should hold a finished round with a {REPORT}, since a later round is "
+                "finished; restore it, or start a new run with another --policy.replay.root"
+            )
+        remedy = "restore it, or delete it to have the round finished again if no later round exists"
+        return [read_json(self._folder(number) / REPORT, remedy) for number in finished]
+
+    def _rounds(self) -> list[int]:
+        """Numbers of the rounds that were begun, in order."""
+        if not self.root.exists():
+            return []
+        names = (re.fullmatch(r"round-(\d{5,})", path.name) for path in self.root.iterdir())
+        return sorted(int(name[1]) for name in names if name)
+
+    def _folder(self, round_number: int) -> Path:
+        return self.root / f"round-{round_number:05d}"
+
+    def _entries(self, round_number: int) -> list[tuple[int, dict[str, Any]]]:
+        """Lines of a round's indices with their ranks, ordered by rank and number."""
+        folder = self._folder(round_number)
+        if not folder.exists():
+            return []
+        names = (re.fullmatch(r"rank-(\d+)\.jsonl", path.name) for path in folder.iterdir())
+        found: dict[tuple[int, int], dict[str, Any]] = {}
+        for rank in (int(name[1]) for name in names if name):
+            path = _index_path(folder, rank)
+            for position, line in enumerate(complete_lines(path), start=1):
+                entry = _parsed(line, path, position)
+                found[rank, entry["number"]] = entry
+        return [(rank, found[rank, number]) for rank, number in sorted(found)]
+
+
+def _parsed(line: str, path: Path, position: int) -> dict[str, Any]:
+    try:
+        entry = json.loads(line)
+        _record(entry)
+        _ = entry["task"], entry["cameras"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"line {position} of {path} is not the record of an episode ({error!r}); delete the line: its episode is "
+            "left out, or collected again if the round is not finished"
+        ) from error
+    return entry
+
+
+def _record(entry: Mapping[str, Any]) -> EpisodeRecord:
+    facts = {key: value for key, value in entry.items() if key not in ("task", "cameras")}
+    return EpisodeRecord.from_json(facts)
+
+
+def _index_path(folder: Path, rank: int) -> Path:
+    return folder / f"rank-{rank}.jsonl"
+
+
+def _frames_path(folder: Path, rank: int, number: int) -> Path:
+    return folder / f"rank-{rank}-{number:06d}.npy"

@@ -1,0 +1,86 @@
+"""The teacher's own chunks at recorded observations: what the discriminator compares the student with."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterable
+
+import torch
+from lerobot.utils.constants import ACTION
+from torch import Tensor
+
+from lerobot_agpd.guidance.teacher import Teacher
+from lerobot_agpd.replay.growing import GrowingTensor
+from lerobot_agpd.replay.replay import Replay
+
+logger = logging.getLogger(__name__)
+
+BATCH_SIZE = 256
+
+
+class TeacherChunks:
+    """Unguided teacher chunks for the frames of T, sampled once per episode and kept in memory.
+
+    Args:
+        teacher: the teacher.
+        replay: T.
+        n_chunk_steps: steps S of the student's chunk from the current one on.
+        seed: of the sampling noise.
+    """
+
+    def __init__(self, teacher: Teacher, replay: Replay, n_chunk_steps: int, seed: int):
+        self.teacher = teacher
+        self.replay = replay
+        self.n_shared = min(n_chunk_steps, teacher.n_chunk_steps)
+        self.n_chunk_steps = n_chunk_steps
+        self.seed = seed
+        self.seconds = 0.0
+        self._chunks: GrowingTensor | None = None  # (N, S, A) in the student's normalized space
+        self._sampled: set[int] = set()  # episodes
+
+    def at(self, frame_index: Tensor, seen_episodes: Iterable[int]) -> tuple[Tensor, int]:
+        """Chunks (B, S, A) in the student's normalized space, zero beyond the shared steps, and their number.
+
+        If an episode of the frames has no chunks yet, all episodes of T that lack them are sampled: the
+        demonstrations' seen episodes and every collected one.
+        """
+        chunks = self._grown(frame_index.device)
+        episodes = set(self.replay.table.episode(frame_index.cpu()).tolist())
+        if not episodes <= self._sampled:
+            collected = range(self.replay.n_demonstrations, len(self.replay.table.lengths))
+            self._sample(sorted({*episodes, *seen_episodes, *collected} - self._sampled), chunks)
+        return chunks[frame_index], self.n_shared
+
+    def _grown(self, device: torch.device) -> Tensor:
+        """Room for the chunks of all frames of T."""
+        if self._chunks is None:
+            action_dim = self.replay.table.columns[ACTION].shape[1]
+            self._chunks = GrowingTensor((self.n_chunk_steps, action_dim), torch.float32, device)
+        self._chunks.grow(len(self.replay.table) - len(self._chunks))
+        return self._chunks.values
+
+    def _sample(self, episodes: list[int], chunks: Tensor) -> None:
+        """Sample whole episodes, each with noise of its own: when an episode is sampled does not change its chunks."""
+        began, n_frames = time.perf_counter(), 0
+        ends = self.replay.table.lengths.cumsum(0).tolist()
+        for episode in episodes:
+            start = ends[episode - 1] if episode else 0
+            generator = torch.Generator(device=chunks.device).manual_seed(self.seed + start)
+            for part in torch.arange(start, ends[episode]).split(BATCH_SIZE):
+                chunks[part] = 0.0
+                chunks[part, : self.n_shared] = self._teacher_chunks(part, generator)
+            n_frames += ends[episode] - start
+        self._sampled.update(episodes)
+        seconds = time.perf_counter() - began
+        self.seconds += seconds
+        logger.info("teacher chunks at %d recorded frames took %.1f s", n_frames, seconds)
+
+    def _teacher_chunks(self, frame_index: Tensor, generator: torch.Generator) -> Tensor:
+        """The shared steps (B, n_shared, A) of newly sampled chunks, in the student's normalized space."""
+        history = self.replay.history(
+            frame_index, list(self.teacher.input_features), self.teacher.n_obs_steps
+        )
+        with torch.autocast(generator.device.type, enabled=False):  # as precise as what it executes
+            raw = self.teacher.sample(history, generator=generator)[:, : self.n_shared]
+        return self.replay.demonstrations.normalizer.normalize(ACTION, raw.to(generator.device))
