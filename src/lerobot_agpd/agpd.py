@@ -40,9 +40,10 @@ from lerobot_agpd.build import Parts
 from lerobot_agpd.config import CollectConfig, GuidanceConfig, StudentConfig
 from lerobot_agpd.guidance.guide import Guide
 from lerobot_agpd.guidance.representation import WEIGHT, reconstruction_loss
-from lerobot_agpd.guidance.teacher import History, Teacher
+from lerobot_agpd.guidance.teacher import History
 from lerobot_agpd.guidance.teacher_student import TeacherStudent
-from lerobot_agpd.replay.replay import FRAME_INDEX, Batch, Replay
+from lerobot_agpd.replay.demonstrations import Batch
+from lerobot_agpd.replay.replay import FRAME_INDEX
 from lerobot_agpd.rollout.report import RoundReport, log_round, round_scalars, success_rate
 from lerobot_agpd.rollout.seeds import STUDENT_NOISE_STREAM
 from lerobot_agpd.rollout.strategies import (
@@ -262,7 +263,9 @@ class AGPD:
             seconds=dict(strategy.stopwatch.seconds),
             diagnostics=self.collector.diagnose(number, strength, strategy),
         )
-        return replace(report, next_scale=self._adapted_scale(report)) if self.config.collect.guides else report
+        return (
+            replace(report, next_scale=self._adapted_scale(report)) if self.config.collect.guides else report
+        )
 
     def _adapted_scale(self, report: RoundReport) -> float:
         # A frozen teacher's own rate is best known from all rounds; one that still learns has only its newest.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 from accelerate import PartialState
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -83,7 +82,10 @@ def build_parts(
         FileNotFoundError: if a checkpoint's counters or collected episodes are missing.
     """
     config, processes = student.config, PartialState()
-    require(not run.shards_weights, "--parallelism.*: AGPD collects with whole policies, so it cannot shard them; use DDP")
+    require(
+        not run.shards_weights,
+        "--parallelism.*: AGPD collects with whole policies, so it cannot shard them; use DDP",
+    )
     progress = Progress.restore(config, run)
     demonstrations = DemonstrationFrames(config, dataset_meta, dataset_stats)
     meta = demonstrations.dataset.meta

@@ -182,7 +182,9 @@ def check_fit(
     if teacher is None:
         return
     if demonstrations is not None:
-        _check_observations(teacher, "the demonstrations (--dataset.*)", demonstrated_features(demonstrations))
+        _check_observations(
+            teacher, "the demonstrations (--dataset.*)", demonstrated_features(demonstrations)
+        )
     elif env_config is not None:
         _check_observations(
             teacher, f"the environment '{env_config.type}' (--env.*)", env_to_policy_features(env_config)

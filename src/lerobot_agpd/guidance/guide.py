@@ -35,7 +35,9 @@ class Posterior:
     x0_hat: Tensor
 
 
-def posterior(scheduler: DDPMScheduler | DDIMScheduler, timestep: int, x_t: Tensor, x0_hat: Tensor, prev_sample: Tensor) -> Posterior:
+def posterior(
+    scheduler: DDPMScheduler | DDIMScheduler, timestep: int, x_t: Tensor, x0_hat: Tensor, prev_sample: Tensor
+) -> Posterior:
     """Posterior of a diffusers DDPM or DDIM step, with strided schedules (DDPM, arXiv:2006.11239, Eq. 6-7).
 
     At eta = 0, DDIM adds no noise and its own sigma is 0, which would switch guidance off; sigma^2 is

@@ -31,8 +31,8 @@ from lerobot.utils.random_utils import seeded_context
 from torch import Tensor
 
 from lerobot_agpd.config import FlagError, GuidancePoint, require
-from lerobot_agpd.guidance.guide import Guide
 from lerobot_agpd.guidance.action_normalizer import ActionNormalizer
+from lerobot_agpd.guidance.guide import Guide
 
 Features = Mapping[str, PolicyFeature]
 

@@ -50,9 +50,9 @@ class TeacherStudent:
     n_steps: int
     normalize: ActionMap
     unnormalize: ActionMap
-    make_discrepancy: (
-        Callable[[TeacherStudent, History, Tensor, ActionDiscrepancy], Discrepancy] | None
-    ) = None
+    make_discrepancy: Callable[[TeacherStudent, History, Tensor, ActionDiscrepancy], Discrepancy] | None = (
+        None
+    )
     student_n_obs_steps: int = 1
     stopwatch: Stopwatch = field(default_factory=Stopwatch)
 

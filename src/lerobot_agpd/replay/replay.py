@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -39,6 +40,23 @@ class ReplayConfig(Protocol):
 
     @property
     def image_features(self) -> Iterable[str]: ...  # noqa: D102
+
+
+@dataclass(frozen=True)
+class ExecutedFuture:
+    """What recorded actions led to, in the student's normalized space.
+
+    Attributes:
+        observation: (B, D) now, features side by side.
+        actions: (B, n, A) recorded.
+        later: (B, D) n steps later.
+        is_pad: (B,) bool, True where that lies beyond the episode.
+    """
+
+    observation: Tensor
+    actions: Tensor
+    later: Tensor
+    is_pad: Tensor
 
 
 class Replay:
@@ -193,21 +211,14 @@ class Replay:
         vectors = (key for key in keys if key in columns)
         return histories | {key: self.table.gather(key, frame_index, deltas)[0] for key in vectors}
 
-    def executed_future(
-        self, frame_index: Tensor, keys: Sequence[str], n_steps: int
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """What the representation learns from, in the student's normalized space.
-
-        Returns:
-            Observations now (B, D), features side by side, the recorded actions (B, n, A) that led to the
-            observations n_steps later (B, D), and the mask (B,) that is True where those lie beyond the episode.
-        """
+    def executed_future(self, frame_index: Tensor, keys: Sequence[str], n_steps: int) -> ExecutedFuture:
+        """What the representation learns from, for frames (B,) and vectors `keys`."""
         gather = self.demonstrations.gather
         actions, _ = gather(ACTION, frame_index, torch.arange(n_steps))
         observed = [gather(key, frame_index, torch.tensor([0, n_steps])) for key in keys]
         now, later = (torch.cat([values[:, step] for values, _ in observed], dim=1) for step in (0, 1))
         _, is_pad = observed[-1]
-        return now, actions, later, is_pad[:, 1]
+        return ExecutedFuture(now, actions, later, is_pad[:, 1])
 
 
 def _column(episode: StoredEpisode, key: str) -> Tensor:

@@ -8,6 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from lerobot.utils.constants import OBS_PREFIX
 
 from lerobot_agpd.replay.episode import Array, EpisodeRecord
 
@@ -39,6 +40,11 @@ class StoredEpisode:
     def keys(self) -> tuple[str, ...]:
         """Names of all columns."""
         return (*(self._open(self.path).dtype.names or ()), *self.cameras)
+
+    @property
+    def observations(self) -> dict[str, Array]:
+        """All observation features, memory-mapped."""
+        return {key: self.column(key) for key in self.keys if key.startswith(OBS_PREFIX)}
 
     def column(self, key: str) -> Array:
         """A feature's values (T, ...), memory-mapped.

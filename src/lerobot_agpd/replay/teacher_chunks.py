@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterable
 
 import torch
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
+from lerobot_agpd.config import StudentConfig
 from lerobot_agpd.guidance.teacher import Teacher
+from lerobot_agpd.replay.demonstrations import Batch
 from lerobot_agpd.replay.growing import GrowingTensor
-from lerobot_agpd.replay.replay import Replay
+from lerobot_agpd.replay.replay import FRAME_INDEX, Replay
 
 logger = logging.getLogger(__name__)
 
@@ -39,7 +40,7 @@ class TeacherChunks:
         self._chunks: GrowingTensor | None = None  # (N, S, A) in the student's normalized space
         self._sampled: set[int] = set()  # episodes
 
-    def at(self, frame_index: Tensor, seen_episodes: Iterable[int]) -> tuple[Tensor, int]:
+    def at(self, frame_index: Tensor) -> tuple[Tensor, int]:
         """Chunks (B, S, A) in the student's normalized space, zero beyond the shared steps, and their number.
 
         If an episode of the frames has no chunks yet, all episodes of T that lack them are sampled: the
@@ -49,8 +50,21 @@ class TeacherChunks:
         episodes = set(self.replay.table.episode(frame_index.cpu()).tolist())
         if not episodes <= self._sampled:
             collected = range(self.replay.n_demonstrations, len(self.replay.table.lengths))
-            self._sample(sorted({*episodes, *seen_episodes, *collected} - self._sampled), chunks)
+            self._sample(sorted({*episodes, *self.replay.seen_episodes, *collected} - self._sampled), chunks)
         return chunks[frame_index], self.n_shared
+
+    def relabel(self, batch: Batch, config: StudentConfig) -> Batch:
+        """A batch of T whose recorded chunks are exchanged for the teacher's own, where `replay.relabel` says so."""
+        frame_index, present = batch[FRAME_INDEX], config.present_step
+        chunks, n_shared = self.at(frame_index)
+        chosen = torch.ones_like(frame_index, dtype=torch.bool)
+        if config.replay.relabel == "demonstrations":
+            chosen = frame_index < self.replay.n_demonstration_frames
+        action, is_pad = batch[ACTION].clone(), batch["action_is_pad"].clone()
+        action[chosen, present : present + n_shared] = chunks[chosen, :n_shared]
+        is_pad[chosen, present : present + n_shared] = False
+        is_pad[chosen, present + n_shared :] = True  # the teacher says nothing of these steps
+        return {**batch, ACTION: action, "action_is_pad": is_pad}
 
     def _grown(self, device: torch.device) -> Tensor:
         """Room for the chunks of all frames of T."""

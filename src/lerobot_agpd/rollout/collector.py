@@ -132,9 +132,7 @@ class Collector:
         on_decision: Callable[[Decision], None] | None,
     ) -> Iterator[Episode]:
         n_envs = min(self.config.collect.n_envs, len(specs))
-        tasks = make_env(
-            self.env_config, n_envs=n_envs, use_async_envs=self.config.collect.use_async_envs
-        )
+        tasks = make_env(self.env_config, n_envs=n_envs, use_async_envs=self.config.collect.use_async_envs)
         environments = [envs for suite in tasks.values() for envs in suite.values()]
         processors = make_env_pre_post_processors(self.env_config, self.config)
         try:

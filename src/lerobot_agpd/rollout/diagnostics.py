@@ -15,6 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lerobot_agpd.guidance.teacher import History
+from lerobot_agpd.replay.episode import Array
+from lerobot_agpd.replay.normalization import Statistics, floor_statistics
 from lerobot_agpd.rollout.diversity import (
     Gaussian,
     gaussian_kl,
@@ -23,9 +26,6 @@ from lerobot_agpd.rollout.diversity import (
     standardize,
     state_coverage,
 )
-from lerobot_agpd.guidance.teacher import History
-from lerobot_agpd.replay.episode import Array
-from lerobot_agpd.replay.normalization import Statistics, floor_statistics
 from lerobot_agpd.rollout.rollout import Decision
 from lerobot_agpd.rollout.strategies import Strategy
 
@@ -176,7 +176,9 @@ def action_kl(actions: Tensor, reference: Tensor) -> Array:
         actions: (K, B, n, A) samples, in the teacher's units.
         reference: samples of the teacher, of the same shape.
     """
-    ours, theirs = (samples.permute(1, 2, 0, 3).flatten(0, 1).double().numpy() for samples in (actions, reference))
+    ours, theirs = (
+        samples.permute(1, 2, 0, 3).flatten(0, 1).double().numpy() for samples in (actions, reference)
+    )
     return np.array([gaussian_kl(_blurred(p), _blurred(q)) for p, q in zip(ours, theirs, strict=True)])
 
 

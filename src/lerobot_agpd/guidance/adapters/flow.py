@@ -12,7 +12,6 @@ from lerobot_agpd.guidance.adapters.diffusion import (
     set_diffusion_sampler,
     stack_cameras,
 )
-from lerobot_agpd.guidance.config import GUIDANCE_POINTS
 from lerobot_agpd.guidance.flow import guided_velocity
 from lerobot_agpd.guidance.guide import Guide, guided
 from lerobot_agpd.guidance.teacher import seeded_by
@@ -33,7 +32,7 @@ class MultiTaskDiTTeacher(DiffusionTeacher):
     @property
     def guidance_points(self) -> tuple[str, ...]:
         """Where J can be differentiated: a flow has no posterior mean."""
-        return ("x0",) if self.policy.config.is_flow_matching else GUIDANCE_POINTS
+        return ("x0",) if self.policy.config.is_flow_matching else ("x0", "mu")
 
     def set_sampler(self, num_inference_steps: int | None, noise_scheduler: str | None) -> None:
         """Exchange the number of steps, and for diffusion the scheduler."""

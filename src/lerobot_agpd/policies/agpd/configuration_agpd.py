@@ -8,15 +8,15 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import DiffuserSchedulerConfig
 from lerobot.policies.act.configuration_act import ACTConfig
 
-from lerobot_agpd.distill.config import DistilledConfig
+from lerobot_agpd.config import StudentConfig, require
 
 
 @PreTrainedConfig.register_subclass("agpd")
 @dataclass
-class AGPDConfig(DistilledConfig, ACTConfig):
+class AGPDConfig(StudentConfig, ACTConfig):
     """LeRobot's ACT with the groups of the distillation; all of ACT's fields keep their meaning and defaults."""
 
-    # As LeRobot's, and observation.environment_state too, which LeRobot's ACT takes as it is.
+    # As LeRobot's ACT, and observation.environment_state too, which that one takes as it is.
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
             "VISUAL": NormalizationMode.MEAN_STD,
@@ -25,19 +25,19 @@ class AGPDConfig(DistilledConfig, ACTConfig):
             "ACTION": NormalizationMode.MEAN_STD,
         }
     )
-    scheduler_name: str | None = (
-        None  # learning rate schedule, e.g. cosine; default: constant, as LeRobot trains ACT
-    )
-    scheduler_warmup_steps: int = 500  # steps over which a scheduled learning rate rises
+    # Learning rate schedule, e.g. cosine; default: constant, as LeRobot trains ACT.
+    scheduler_name: str | None = None
+    # Steps over which a scheduled learning rate rises.
+    scheduler_warmup_steps: int = 500
 
     def __post_init__(self) -> None:
         super().__post_init__()
         n_steps = self.collect.n_action_steps
-        if n_steps is not None and n_steps > self.chunk_size:
-            raise ValueError(
-                f"--policy.collect.n_action_steps={n_steps} exceeds the student's chunk "
-                f"(--policy.chunk_size={self.chunk_size})"
-            )
+        require(
+            n_steps is None or n_steps <= self.chunk_size,
+            f"--policy.collect.n_action_steps={n_steps} exceeds the student's chunk "
+            f"(--policy.chunk_size={self.chunk_size})",
+        )
 
     def get_scheduler_preset(self) -> DiffuserSchedulerConfig | None:
         """The named schedule over the run's steps, None for a constant learning rate."""
@@ -51,21 +51,11 @@ class AGPDConfig(DistilledConfig, ACTConfig):
         return None
 
     @property
-    def chunk_offsets(self) -> list[int]:
+    def chunk_delta_indices(self) -> list[int]:
         """Steps of a chunk relative to the current one."""
         return list(range(self.chunk_size))
 
     @property
-    def chunk_delta_indices(self) -> list[int]:
-        """Steps of a chunk relative to the current one."""
-        return self.chunk_offsets
-
-    @property
     def history_length(self) -> None:
-        """None: ACT looks at the current observation alone, without a time dimension."""
-        return None
-
-    @property
-    def observation_history(self) -> None:
         """None: ACT looks at the current observation alone, without a time dimension."""
         return None

@@ -8,16 +8,18 @@ from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.utils.constants import OBS_IMAGES
 from torch import Tensor
 
-from lerobot_agpd.distill.student import DistilledStudent
 from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig
+from lerobot_agpd.policies.distilled import DistilledPolicy
 from lerobot_agpd.replay.normalization import Statistics
+from lerobot_agpd.run import RunInfo
+from lerobot_agpd.student import PriorChunk
 
 
-class AGPDPolicy(DistilledStudent, ACTPolicy):
+class AGPDPolicy(DistilledPolicy, ACTPolicy):
     """ACT (arXiv:2304.13705) distilled from a diffusion policy; in eval mode it is LeRobot's ACT."""
 
+    config: AGPDConfig
     config_class = AGPDConfig
-    model: Any
     name = "agpd"
 
     def __init__(
@@ -25,29 +27,27 @@ class AGPDPolicy(DistilledStudent, ACTPolicy):
         config: AGPDConfig,
         dataset_stats: Statistics | None = None,
         dataset_meta: LeRobotDatasetMetadata | None = None,
+        run: RunInfo | None = None,
         **kwargs: Any,
     ):
         """Build ACT and the adversary; without `dataset_meta` the policy can be evaluated but not trained."""
         super().__init__(config, **kwargs)
-        self.init_distillation(dataset_meta, dataset_stats)
+        self.init_distillation(dataset_meta, dataset_stats, run)
 
     @property
     def embedding_dim(self) -> int:
         """Width of ACT's transformer."""
         return self.config.dim_model
 
-    def prior_chunk(self, rows: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def prior_chunk(self, batch: Mapping[str, Tensor]) -> PriorChunk:
         """ACT's chunk with its latent at the prior's mean, as executed, and its mean encoder token.
 
         In training mode ACT decodes from a latent that has seen the recorded actions. Here the actions are left
         out and the network runs in eval mode (no dropout either), with gradients.
-
-        Returns:
-            Chunks (B, S, A) and embeddings (B, dim_model).
         """
-        inputs: dict[str, Any] = {key: rows[key] for key in self.config.input_features}
+        inputs: dict[str, Any] = {key: batch[key] for key in self.config.input_features}
         if self.config.image_features:
-            inputs[OBS_IMAGES] = [rows[key] for key in self.config.image_features]
+            inputs[OBS_IMAGES] = [batch[key] for key in self.config.image_features]
         tokens: list[Tensor] = []  # (n_tokens, B, dim_model)
         hook = self.model.encoder.register_forward_hook(lambda module, args, output: tokens.append(output))
         was_training = self.model.training
@@ -57,4 +57,4 @@ class AGPDPolicy(DistilledStudent, ACTPolicy):
         finally:
             self.model.train(was_training)
             hook.remove()
-        return chunk, tokens[0].mean(dim=0)
+        return PriorChunk(chunk, tokens[0].mean(dim=0))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from lerobot.configs import PreTrainedConfig
 
-from lerobot_agpd.distill.config import DistilledConfig
+from lerobot_agpd.config import StudentConfig
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
     DiffusionTransformerConfig,
 )
@@ -14,11 +14,14 @@ from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transfo
 
 @PreTrainedConfig.register_subclass("agpd_diffusion")
 @dataclass
-class AGPDDiffusionConfig(DistilledConfig, DiffusionTransformerConfig):
+class AGPDDiffusionConfig(StudentConfig, DiffusionTransformerConfig):
     """A diffusion policy (`denoiser` transformer: DP-T, unet: DP-C, or mlp) with the groups of the distillation.
 
     With `teacher.path` it learns from that teacher; without, from itself (self-distillation).
     """
+
+    # Observations in a history (declared again: StudentConfig's base has 1).
+    n_obs_steps: int = 2
 
     def _check_memory(self) -> None:
         """Images are allowed: T reads those from disk."""
@@ -40,10 +43,5 @@ class AGPDDiffusionConfig(DistilledConfig, DiffusionTransformerConfig):
 
     @property
     def history_length(self) -> int:
-        """Steps of an observation."""
-        return self.n_obs_steps
-
-    @property
-    def observation_history(self) -> int:
-        """Steps of an observation."""
+        """Observations in a history."""
         return self.n_obs_steps

@@ -9,21 +9,24 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_IMAGES
 from torch import Tensor
 
-from lerobot_agpd.distill.student import DistilledStudent
 from lerobot_agpd.policies.agpd_diffusion.configuration_agpd_diffusion import AGPDDiffusionConfig
 from lerobot_agpd.policies.diffusion_transformer.model import condition_dim
 from lerobot_agpd.policies.diffusion_transformer.modeling_diffusion_transformer import (
     DiffusionTransformerPolicy,
 )
+from lerobot_agpd.policies.distilled import DistilledPolicy
 from lerobot_agpd.replay.normalization import Statistics
+from lerobot_agpd.run import RunInfo
+from lerobot_agpd.student import PriorChunk
 
 
-class AGPDDiffusionPolicy(DistilledStudent, DiffusionTransformerPolicy):
+class AGPDDiffusionPolicy(DistilledPolicy, DiffusionTransformerPolicy):
     """A diffusion policy distilled from another one, or from itself (Table 1).
 
     The averaged weights act: they are evaluated, propose chunks while collecting, and teach in self-distillation.
     """
 
+    config: AGPDDiffusionConfig
     config_class = AGPDDiffusionConfig
     name = "agpd_diffusion"
     can_teach_itself = True
@@ -33,38 +36,37 @@ class AGPDDiffusionPolicy(DistilledStudent, DiffusionTransformerPolicy):
         config: AGPDDiffusionConfig,
         dataset_stats: Statistics | None = None,
         dataset_meta: LeRobotDatasetMetadata | None = None,
+        run: RunInfo | None = None,
         **kwargs: Any,
     ):
         """Build the policy and the adversary; without `dataset_meta` it can be evaluated but not trained."""
-        super().__init__(config, dataset_stats, dataset_meta, **kwargs)
-        self.init_distillation(dataset_meta, dataset_stats)
+        run = run or RunInfo.of(config)
+        super().__init__(config, dataset_stats, dataset_meta, run, **kwargs)
+        self.init_distillation(dataset_meta, dataset_stats, run)
 
     @property
     def embedding_dim(self) -> int:
         """Width of the condition: all observations of the history side by side, images encoded."""
         return condition_dim(self.config, self.diffusion)
 
-    def prior_chunk(self, rows: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def prior_chunk(self, batch: Mapping[str, Tensor]) -> PriorChunk:
         """The clean chunk x0_hat that one denoising step estimates, and the condition.
 
         Recorded chunks are noised to a random level, as in training, and the estimate is clipped as in sampling.
         Unlike ACT's prior chunk it depends on the recorded chunk: a denoiser has nothing else to denoise.
-
-        Returns:
-            Chunks (B, S, A) from the current step on and conditions (B, E).
         """
-        inputs = dict(rows)
+        inputs = dict(batch)
         if self.config.image_features:
-            inputs[OBS_IMAGES] = torch.stack([rows[key] for key in self.config.image_features], dim=-4)
+            inputs[OBS_IMAGES] = torch.stack([batch[key] for key in self.config.image_features], dim=-4)
         condition = self.diffusion._prepare_global_conditioning(inputs)  # (B, E)
-        clean = rows[ACTION]
+        clean = batch[ACTION]
         scheduler: Any = self.diffusion.noise_scheduler
         noise = torch.randn_like(clean)
         levels = torch.randint(scheduler.config.num_train_timesteps, clean.shape[:1], device=clean.device)
         noisy = scheduler.add_noise(clean, noise, levels)
         predicted = self.diffusion.unet(noisy, levels, global_cond=condition)
         x0_hat = clean_estimate(scheduler, noisy, predicted, levels)
-        return x0_hat[:, self.config.n_obs_steps - 1 :], condition
+        return PriorChunk(x0_hat[:, self.config.n_obs_steps - 1 :], condition)
 
     def snapshot(self) -> PreTrainedPolicy:
         """A plain diffusion policy with the averaged weights (if there are any), in evaluation mode."""

@@ -73,7 +73,7 @@ class EMAConfig:
     """Exponential moving average of the weights, used for evaluation and as a teacher.
 
     The defaults are those of arXiv:2303.04137. Only parameters are averaged, not the running statistics of
-    batch normalisation: with images, that paper replaces it (`--policy.use_group_norm=true
+    batch normalization: with images, that paper replaces it (`--policy.use_group_norm=true
     --policy.pretrained_backbone_weights=null`).
     """
 
@@ -188,14 +188,9 @@ class DiffusionTransformerConfig(DiffusionConfig):
     @property
     def action_delta_indices(self) -> list | None:
         """Action chunk asked of the loader; None if it is cut from memory."""
-        return None if self.in_memory else self.chunk_offsets
-
-    @property
-    def chunk_offsets(self) -> list[int]:
-        """Steps of a chunk relative to the current one."""
-        return super().action_delta_indices
+        return None if self.in_memory else self.chunk_delta_indices
 
     @property
     def chunk_delta_indices(self) -> list[int]:
         """Steps of a chunk relative to the current one."""
-        return self.chunk_offsets
+        return super().action_delta_indices

@@ -22,7 +22,7 @@ from lerobot_agpd.policies.diffusion_transformer.model import DenoisingModel
 from lerobot_agpd.policies.diffusion_transformer.transformer import weight_decay_groups
 from lerobot_agpd.replay.demonstrations import DemonstrationFrames, delivers_single_frames
 from lerobot_agpd.replay.normalization import Statistics
-from lerobot_agpd.run import this_run
+from lerobot_agpd.run import RunInfo
 from lerobot_agpd.weights import require_weights
 
 logger = logging.getLogger(__name__)
@@ -49,6 +49,7 @@ class DiffusionTransformerPolicy(DiffusionPolicy):
         config: DiffusionTransformerConfig,
         dataset_stats: Statistics | None = None,
         dataset_meta: LeRobotDatasetMetadata | None = None,
+        run: RunInfo | None = None,
         **kwargs: Any,
     ):
         """Build the policy; with `dataset_meta` its frames are loaded into memory at the first training step."""
@@ -56,6 +57,7 @@ class DiffusionTransformerPolicy(DiffusionPolicy):
         PreTrainedPolicy.__init__(self, config)
         config.validate_features()
         self.config: DiffusionTransformerConfig = config
+        self.run = run or RunInfo.of(config)
         self.diffusion = self.model_class(config)
         self.reset()
         self._dataset = (dataset_meta, dataset_stats)
@@ -111,7 +113,7 @@ class DiffusionTransformerPolicy(DiffusionPolicy):
             )
         if any(isinstance(module, nn.modules.batchnorm._BatchNorm) for module in self.diffusion.modules()):
             logger.warning(
-                "batch normalisation's running statistics are not averaged with the weights; consider "
+                "batch normalization's running statistics are not averaged with the weights; consider "
                 "--policy.use_group_norm=true --policy.pretrained_backbone_weights=null"
             )
         ema = EMAModel(
@@ -122,7 +124,7 @@ class DiffusionTransformerPolicy(DiffusionPolicy):
             foreach=True,
         )
         checkpoint = self.config.pretrained_path
-        if checkpoint and this_run().resume:
+        if checkpoint and self.run is not None and self.run.resume:
             ema.optimization_step = self._load_raw_weights(Path(checkpoint))
         return ema
 

@@ -14,27 +14,27 @@ LEAST_UNIT = 1e-6
 """Raw size of a normalized unit below which a dimension counts as constant."""
 
 
-class ActionUnits:
-    """Raw actions in the units of a checkpoint's normaliser.
+class ActionNormalizer:
+    """Raw actions in the units of a checkpoint's normalizer.
 
     A dimension that never varied in the teacher's data (an unused gripper) is the constant it has there, whatever it
     is given: LeRobot divides it by 1e-8, so a student's rounding error would outweigh all other dimensions in J.
 
     Args:
-        normaliser: of the checkpoint's preprocessor.
+        normalizer: of the checkpoint's preprocessor.
         action_dim: dimensions A of an action.
     """
 
-    def __init__(self, normaliser: NormalizerProcessorStep, action_dim: int):
-        self._normaliser = normaliser
+    def __init__(self, normalizer: NormalizerProcessorStep, action_dim: int):
+        self._normalizer = normalizer
         self._ends = torch.tensor([[0.0], [1.0]]).expand(2, action_dim)
         self._varies: Tensor | None = None
-        mode = normaliser.norm_map.get(FeatureType.ACTION)
+        mode = normalizer.norm_map.get(FeatureType.ACTION)
         self._constant = (
             0.0 if mode == NormalizationMode.MEAN_STD else -1.0
         )  # what LeRobot makes of the only value
 
-    def of(self, actions_raw: Tensor) -> Tensor:
+    def normalize(self, actions_raw: Tensor) -> Tensor:
         """Raw actions (..., A) in the normalized space."""
         if self._varies is None or self._varies.device != actions_raw.device:
             low, high = self._normalized(self._ends.to(actions_raw))
@@ -42,4 +42,4 @@ class ActionUnits:
         return self._normalized(actions_raw).where(self._varies, self._constant)
 
     def _normalized(self, actions_raw: Tensor) -> Any:
-        return self._normaliser({TransitionKey.ACTION: actions_raw})[TransitionKey.ACTION]
+        return self._normalizer({TransitionKey.ACTION: actions_raw})[TransitionKey.ACTION]
