@@ -195,7 +195,7 @@ class AGPD:
         before, self.progress.step = self.progress.step, self.progress.step + self.run.steps_per_update
         self.progress.seen_episodes = sorted(self.replay.seen_episodes)
         due = rounds_due(self.progress.step, self.config.collect)
-        is_last = self.run.steps is not None and self.progress.step >= self.run.steps
+        is_last = self.run.steps is not None and self.progress.step + self.run.steps_per_update > self.run.steps
         # None after the last step, because no student would learn from it; none twice, if a killed run has it already.
         if due > rounds_due(before, self.config.collect) and due > len(self.reports) and not is_last:
             self.collect_round()
