@@ -9,10 +9,10 @@ from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.transforms import ImageTransforms
 
-from lerobot_agpd.replay.episode import Episode, Ticket
-from lerobot_agpd.replay.memory import FrameMemory
-from lerobot_agpd.replay.replay import ROW, Replay
-from lerobot_agpd.replay.writer import EpisodeWriter
+from lerobot_agpd.replay.demonstrations import DemonstrationFrames
+from lerobot_agpd.replay.episode import Episode, EpisodeRecord, EpisodeSpec
+from lerobot_agpd.replay.journal import EpisodeJournal
+from lerobot_agpd.replay.replay import FRAME_INDEX, Replay
 from lerobot_agpd.run import this_run
 
 IMAGE, STATE = "observation.image", "observation.state"
@@ -47,13 +47,14 @@ def demonstrations(tmp_path_factory) -> LeRobotDataset:
 
 @pytest.fixture(scope="module")
 def collected(demonstrations, tmp_path_factory):
-    root = tmp_path_factory.mktemp("rounds") / "round-000" / "rank-0"
+    journal = EpisodeJournal(tmp_path_factory.mktemp("journal"))
+    journal.begin(demonstrations.meta, {})
     observations = {IMAGE: pixels(COLLECTED), STATE: column(COLLECTED)}
     rewards = np.zeros(len(COLLECTED), dtype=np.float32)
-    ticket = Ticket(0, 0, 0.0)
-    episode = Episode(ticket, "look", observations, column(COLLECTED), rewards, None, 0.0, 0.0)
-    EpisodeWriter(demonstrations.meta).write(root, [episode], 0, "guided")
-    return root
+    episode = Episode(EpisodeSpec(0, 0, 0.0), "look", observations, column(COLLECTED), rewards, None)
+    record = EpisodeRecord(0, 0, 0.0, len(COLLECTED), 0.0, None, True, False, True)
+    journal.append(0, 0, episode, record)
+    return journal.kept(0)
 
 
 class Negative:
@@ -69,7 +70,7 @@ class Negative:
 
 @pytest.fixture
 def make_replay(demonstrations, collected):
-    """T without normalisation and the loader's batch of all demonstrations, delivered as pixel value 0.25."""
+    """T without normalization and the loader's batch of all demonstrations, delivered as pixel value 0.25."""
 
     def build(make_config, transform, **options):
         config = make_config(
@@ -81,7 +82,7 @@ def make_replay(demonstrations, collected):
             normalization_mapping=dict.fromkeys(("VISUAL", "STATE", "ACTION"), NormalizationMode.IDENTITY),
             **options,
         )
-        replay = Replay(FrameMemory(config, demonstrations.meta, {}), config, 0.5, transform)
+        replay = Replay(DemonstrationFrames(config, demonstrations.meta, {}), config, 0.5, transform)
         batch = {
             "index": torch.arange(4).repeat(8),
             "episode_index": torch.zeros(32, dtype=torch.long),
@@ -90,7 +91,7 @@ def make_replay(demonstrations, collected):
             "action": torch.arange(4.0).repeat(8)[:, None],
         }
         replay.observe(batch)
-        replay.add_dataset(collected)
+        replay.extend(collected)
         return replay, batch
 
     return build
@@ -110,30 +111,41 @@ def values(images):
 def test_collected_frames_are_transformed_and_the_loaders_are_left_alone(make_replay, agpd_config):
     transform = Negative()
     replay, batch = make_replay(agpd_config, transform)
-    rows = replay.training_rows(batch, generator())
-    exchanged = rows[ROW] >= len(DEMONSTRATED)
+    drawn = replay.train_batch(batch, generator())
+    exchanged = drawn[FRAME_INDEX] >= len(DEMONSTRATED)
     assert 0 < exchanged.sum() < 32
-    assert torch.equal(rows[IMAGE][~exchanged], batch[IMAGE][~exchanged])
-    assert torch.equal(values(rows[IMAGE][exchanged]), 255 - rows[STATE][exchanged, 0].long())
+    assert torch.equal(drawn[IMAGE][~exchanged], batch[IMAGE][~exchanged])
+    assert torch.equal(values(drawn[IMAGE][exchanged]), 255 - drawn[STATE][exchanged, 0].long())
     assert transform.shapes == [SHAPE] * int(exchanged.sum())
 
 
 def test_a_history_is_transformed_as_one(make_replay, agpd_diffusion_config):
     transform = Negative()
     replay, batch = make_replay(agpd_diffusion_config, transform, drop_n_last_frames=0)
-    rows = replay.training_rows(batch, generator())
-    assert (rows[ROW] >= len(DEMONSTRATED)).any() and (rows[ROW] < len(DEMONSTRATED)).any()
-    assert rows[IMAGE].shape == (32, 2, *SHAPE)
-    assert torch.equal(values(rows[IMAGE]), 255 - rows[STATE][..., 0].long())
+    drawn = replay.train_batch(batch, generator())
+    assert (drawn[FRAME_INDEX] >= len(DEMONSTRATED)).any() and (drawn[FRAME_INDEX] < len(DEMONSTRATED)).any()
+    assert drawn[IMAGE].shape == (32, 2, *SHAPE)
+    assert torch.equal(values(drawn[IMAGE]), 255 - drawn[STATE][..., 0].long())
     assert transform.shapes == [(2, *SHAPE)] * 32, "one draw for a history, as in LeRobot's loader"
 
 
-def test_held_out_rows_and_the_teachers_histories_are_not_transformed(make_replay, agpd_diffusion_config):
+def test_held_out_batches_and_the_teachers_histories_are_not_transformed(make_replay, agpd_diffusion_config):
     replay, batch = make_replay(agpd_diffusion_config, Negative())
-    rows = replay.demonstration_rows(batch)
-    assert torch.equal(values(rows[IMAGE]), rows[STATE][..., 0].long())
+    drawn = replay.eval_batch(batch)
+    assert torch.equal(values(drawn[IMAGE]), drawn[STATE][..., 0].long())
     history = replay.history(torch.tensor([2, 5]), [IMAGE], 2)[IMAGE]
     assert values(history).tolist() == [[1, 2], [200, 201]]
+
+
+def test_a_frame_is_decoded_once_for_all_cameras_and_rows(make_replay, agpd_diffusion_config, monkeypatch):
+    replay, batch = make_replay(agpd_diffusion_config, None, drop_n_last_frames=0)
+    decoded, read = [], LeRobotDataset.__getitem__
+    monkeypatch.setattr(
+        LeRobotDataset, "__getitem__", lambda self, index: decoded.append(index) or read(self, index)
+    )
+    drawn = replay.eval_batch(batch)
+    assert sorted(decoded) == [0, 1, 2, 3]
+    assert torch.equal(values(drawn[IMAGE]), drawn[STATE][..., 0].long())
 
 
 def test_the_runs_transforms_are_found(monkeypatch, tmp_path):

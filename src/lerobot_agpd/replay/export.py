@@ -53,13 +53,14 @@ def merge(root: Path, repo_id: str | None = None) -> LeRobotDataset | None:
             dataset written by this function.
     """
     journal = EpisodeJournal(root)
-    merged, partial = root / MERGED, root / f"{MERGED}.partial"
+    merged, partial, replaced = (root / f"{MERGED}{suffix}" for suffix in ("", ".partial", ".replaced"))
     _check_replaceable(merged)
     episodes = iter(journal.stored())
     first = next(episodes, None)
     if first is None:
         return None
-    shutil.rmtree(partial, ignore_errors=True)
+    for leftover in (partial, replaced):
+        shutil.rmtree(leftover, ignore_errors=True)
     repo_id = repo_id or f"agpd/{root.resolve().parent.name}"
     features = _merged_features(journal, first)
     dataset = LeRobotDataset.create(
@@ -73,8 +74,10 @@ def merge(root: Path, repo_id: str | None = None) -> LeRobotDataset | None:
     for round_number, episode in (first, *episodes):
         _add(dataset, features, episode, _columns(journal, round_number, episode))
     dataset.finalize()
-    shutil.rmtree(merged, ignore_errors=True)
+    if merged.exists():
+        merged.rename(replaced)
     partial.rename(merged)
+    shutil.rmtree(replaced, ignore_errors=True)
     return LeRobotDataset(repo_id, root=merged)
 
 

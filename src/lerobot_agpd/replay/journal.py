@@ -202,7 +202,7 @@ def _parsed(line: str, path: Path, position: int) -> dict[str, Any]:
         entry = json.loads(line)
         _record(entry)
         _ = entry["task"], entry["cameras"]
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(
             f"line {position} of {path} is not the record of an episode ({error!r}); delete the line: its episode is "
             "left out, or collected again if the round is not finished"

@@ -6,7 +6,7 @@ from lerobot.lerobot_types import TransitionKey
 from lerobot.processor import NormalizerProcessorStep
 
 from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig
-from lerobot_agpd.replay.normalisation import Normaliser, floor_statistics, matching_normaliser
+from lerobot_agpd.replay.normalization import Normalizer, floor_statistics, matching_normalizer
 
 KEY = "observation.environment_state"
 
@@ -38,32 +38,32 @@ OTHER = stats([1.1, -2.0], [2.0, 0.5], [0.0, -4.0], [4.4, 0.0])
 )
 @settings(deadline=None)
 def test_property_round_trip(mode, key, spreads, shape):
-    centre, width = (list(column) for column in zip(*spreads, strict=True))
+    center, width = (list(column) for column in zip(*spreads, strict=True))
     high = [c + w for c, w in spreads]
-    normaliser = Normaliser(config(mode), stats(centre, width, centre, high))
+    normalizer = Normalizer(config(mode), stats(center, width, center, high))
     raw = torch.randn(shape) * 10
-    back = normaliser.unnormalise(key, normaliser.normalise(key, raw))
+    back = normalizer.unnormalize(key, normalizer.normalize(key, raw))
     torch.testing.assert_close(back, raw, rtol=1e-4, atol=1e-3)
 
 
 def test_by_hand():
     raw = torch.tensor([[3.0, -3.0]])
-    assert Normaliser(config("MEAN_STD"), ONE).normalise(KEY, raw).tolist() == [[1.0, -2.0]]
-    assert Normaliser(config("MIN_MAX"), ONE).normalise("action", raw).tolist() == [[0.5, -0.5]]
-    assert Normaliser(config("MIN_MAX"), ONE).unnormalise("action", torch.tensor([[1.0, 0.0]])).tolist() == [
+    assert Normalizer(config("MEAN_STD"), ONE).normalize(KEY, raw).tolist() == [[1.0, -2.0]]
+    assert Normalizer(config("MIN_MAX"), ONE).normalize("action", raw).tolist() == [[0.5, -0.5]]
+    assert Normalizer(config("MIN_MAX"), ONE).unnormalize("action", torch.tensor([[1.0, 0.0]])).tolist() == [
         [4.0, -2.0]
     ]
 
 
-def test_normalise_is_what_lerobots_step_does():
+def test_normalize_is_what_lerobots_step_does():
     settings_ = config()
     features = {**settings_.input_features, **settings_.output_features}
     step = NormalizerProcessorStep(features=features, norm_map=settings_.normalization_mapping, stats=ONE)
     raw = {KEY: torch.randn(4, 2), "action": torch.randn(4, 2)}
     theirs = step({TransitionKey.OBSERVATION: {KEY: raw[KEY]}, TransitionKey.ACTION: raw["action"]})
-    ours = Normaliser(settings_, ONE)
-    assert torch.equal(ours.normalise(KEY, raw[KEY]), theirs[TransitionKey.OBSERVATION][KEY])
-    assert torch.equal(ours.normalise("action", raw["action"]), theirs[TransitionKey.ACTION])
+    ours = Normalizer(settings_, ONE)
+    assert torch.equal(ours.normalize(KEY, raw[KEY]), theirs[TransitionKey.OBSERVATION][KEY])
+    assert torch.equal(ours.normalize("action", raw["action"]), theirs[TransitionKey.ACTION])
 
 
 def test_floor_statistics_by_hand():
@@ -85,32 +85,32 @@ def test_floor_statistics_leaves_entries_without_spread_alone():
 def test_rounding_errors_of_a_constant_feature_stay_small(mode):
     constant = stats([0.3, 1.0], [0.0, 1.0], [0.3, 0.0], [0.3, 2.0])
     raw = torch.tensor([[0.3 + 1e-6, 1.0]])
-    assert Normaliser(config(mode), floor_statistics(constant)).normalise(KEY, raw).abs().max() < 0.01
-    assert Normaliser(config(mode), constant).normalise(KEY, raw).abs().max() > 1
+    assert Normalizer(config(mode), floor_statistics(constant)).normalize(KEY, raw).abs().max() < 0.01
+    assert Normalizer(config(mode), constant).normalize(KEY, raw).abs().max() > 1
 
 
 @pytest.mark.parametrize("right", [0, 1])
-def test_matching_normaliser_picks_the_statistics_in_use(right):
+def test_matching_normalizer_picks_the_statistics_in_use(right):
     raw = {KEY: torch.randn(8, 2) * 3, "action": torch.randn(8, 2) * 3}
-    loop = Normaliser(config(), (ONE, OTHER)[right])
-    delivered = {key: loop.normalise(key, values) for key, values in raw.items()}
-    found = matching_normaliser(config(), [("one", ONE), ("other", OTHER)], raw, delivered)
+    loop = Normalizer(config(), (ONE, OTHER)[right])
+    delivered = {key: loop.normalize(key, values) for key, values in raw.items()}
+    found = matching_normalizer(config(), [("one", ONE), ("other", OTHER)], raw, delivered)
     for key, values in raw.items():
-        assert torch.equal(found.normalise(key, values), delivered[key])
+        assert torch.equal(found.normalize(key, values), delivered[key])
 
 
 def test_first_of_equal_candidates_wins():
     raw = {KEY: torch.randn(8, 2), "action": torch.randn(8, 2)}
     almost = stats([1.0, -2.0], [2.0, 0.5 + 1e-7], [0.0, -4.0], [4.0, 0.0])
-    delivered = {key: Normaliser(config(), ONE).normalise(key, values) for key, values in raw.items()}
-    found = matching_normaliser(config(), [("almost", almost), ("one", ONE)], raw, delivered)
-    assert found._normalise.stats["action"]["std"][1] == almost["action"]["std"][1]
+    delivered = {key: Normalizer(config(), ONE).normalize(key, values) for key, values in raw.items()}
+    found = matching_normalizer(config(), [("almost", almost), ("one", ONE)], raw, delivered)
+    assert found.stats["action"]["std"][1] == almost["action"]["std"][1]
 
 
 def test_one_feature_that_does_not_match_is_enough_to_refuse():
     raw = {KEY: torch.randn(8, 2), "action": torch.randn(8, 2)}
-    loop = Normaliser(config(), ONE)
-    delivered = {key: loop.normalise(key, values) for key, values in raw.items()}
+    loop = Normalizer(config(), ONE)
+    delivered = {key: loop.normalize(key, values) for key, values in raw.items()}
     delivered["action"] = delivered["action"] * 1.05 + 0.05
     with pytest.raises(ValueError, match="no known statistics.*'one'.*'other'"):
-        matching_normaliser(config(), [("one", ONE), ("other", OTHER)], raw, delivered)
+        matching_normalizer(config(), [("one", ONE), ("other", OTHER)], raw, delivered)

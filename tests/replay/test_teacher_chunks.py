@@ -1,0 +1,82 @@
+"""The teacher's own chunks on T."""
+
+import pytest
+import torch
+
+from lerobot_agpd.replay.demonstrations import DemonstrationFrames
+from lerobot_agpd.replay.replay import Replay
+from lerobot_agpd.replay.teacher_chunks import TeacherChunks
+
+STATE = "observation.state"
+
+
+class Teacher:
+    """Answers with the state, its step counted on, and noise; notes the frames it is asked for."""
+
+    n_obs_steps, n_chunk_steps = 2, 3
+    input_features = {STATE: None}
+
+    def __init__(self):
+        self.sampled = []
+
+    def sample(self, history, generator):
+        state = history[STATE][:, -1]
+        self.sampled += [tuple(row) for row in state.tolist()]
+        steps = torch.arange(5.0)[None, :, None]  # more than it has from now on
+        return state[:, None] + steps + torch.rand((len(state), 5, 2), generator=generator)
+
+
+@pytest.fixture
+def replay(demonstrations, agpd_config) -> Replay:
+    config = agpd_config(chunk_size=4, n_action_steps=2)
+    frames = DemonstrationFrames(config, demonstrations.meta, demonstrations.meta.stats)
+    replay = Replay(frames, config, None)
+    columns = {key: frames.table.columns[key][:3] for key in frames.keys}
+    replay.observe({**columns, "index": torch.arange(3), "episode_index": torch.zeros(3, dtype=torch.long)})
+    return replay
+
+
+@pytest.fixture
+def chunks(replay):
+    return TeacherChunks(Teacher(), replay, n_chunk_steps=4, seed=7)
+
+
+def raw(chunks, frames, seen=()):
+    found, shared = chunks.at(torch.tensor(frames), seen)
+    normalizer = chunks.replay.demonstrations.normalizer
+    return normalizer.unnormalize("action", found[:, :shared]), found[:, shared:]
+
+
+def test_chunks_are_the_teachers_and_zero_beyond_its_own(chunks):
+    found, beyond = raw(chunks, [0, 4, 6], {0})
+    expected = torch.tensor([[0.0, 0.0], [0.0, 4.0], [2.0, 0.0]])[:, None] + torch.arange(3.0)[None, :, None]
+    assert (
+        found.shape == (3, 3, 2)
+        and ((found - expected) > -1e-4).all()
+        and ((found - expected) < 1.0001).all()
+    )
+    assert beyond.shape == (3, 1, 2) and not beyond.any()
+
+
+def test_noise_is_the_episodes_own(chunks, demonstrations):
+    """Seeded by the episode's first frame: when it is sampled does not matter."""
+    found, _ = raw(chunks, [6, 8], {2})
+    noise = torch.rand((7, 5, 2), generator=torch.Generator().manual_seed(7 + 6))
+    states = torch.tensor([[2.0, 0.0], [2.0, 2.0]])[:, None] + torch.arange(3.0)[None, :, None]
+    torch.testing.assert_close(found, states + noise[[0, 2], :3], rtol=0, atol=1e-4)
+    other = TeacherChunks(Teacher(), chunks.replay, n_chunk_steps=4, seed=7)
+    raw(other, [0], {0, 1})
+    assert torch.equal(raw(other, [6, 8], {2})[0], found)
+
+
+def test_every_frame_is_sampled_once(chunks, stored):
+    raw(chunks, [0], {0})
+    assert chunks.teacher.sampled == [(0, step) for step in range(5)]
+    chunks.replay.extend(stored(3, 2))
+    before, _ = raw(chunks, [1])
+    assert len(chunks.teacher.sampled) == 5, "nothing of it was asked for"
+    raw(chunks, [13, 17], {0, 2})
+    assert len(chunks.teacher.sampled) == 5 + 7 + 3 + 2 and len(set(chunks.teacher.sampled)) == 17
+    raw(chunks, list(range(5)) + list(range(6, 18)), {0, 2})
+    assert len(chunks.teacher.sampled) == 17
+    assert torch.equal(raw(chunks, [1])[0], before), "growth keeps what is there"
