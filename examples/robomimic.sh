@@ -7,7 +7,7 @@
 source "$(dirname "$0")/common.sh"
 task=${1:-lift}
 output=${2:-outputs/$task}
-env=(--env.type=robomimic --env.task="$task")
+env=(--env.type=robosuite_robomimic --env.task="$task")
 settings "$output"
 
 record "$output/many" "$MANY" 10000 "${env[@]}"

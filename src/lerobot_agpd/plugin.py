@@ -1,17 +1,66 @@
-"""Registers everything this plugin adds to LeRobot: policy types and environment types."""
+"""Register everything this plugin adds to LeRobot: policy types and environment types.
 
+Every type is registered on its own. Another plugin may hold one of the names already, and LeRobot drops a plugin whose
+import fails: without the guard a clash of one name would cost all types.
+"""
+
+import importlib
+import logging
 import multiprocessing
+from collections.abc import Mapping
 
-import lerobot_agpd.envs.aloha
-import lerobot_agpd.envs.gymnasium_robotics
-import lerobot_agpd.envs.robomimic
-import lerobot_agpd.policies.act_diffusion.configuration_act_diffusion
-import lerobot_agpd.policies.agpd.configuration_agpd
-import lerobot_agpd.policies.agpd_diffusion.configuration_agpd_diffusion
-import lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer  # noqa: F401
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs.configs import EnvConfig
+
+logger = logging.getLogger(__name__)
+
+ENV_TYPES = {
+    "aloha_state": "lerobot_agpd.envs.aloha",
+    "gymnasium_robotics": "lerobot_agpd.envs.gymnasium_robotics",
+    "robosuite_robomimic": "lerobot_agpd.envs.robomimic",
+}
+"""`--env.type` to the module that registers it."""
+
+POLICY_TYPES = {
+    name: f"lerobot_agpd.policies.{name}.configuration_{name}"
+    for name in ("diffusion_transformer", "act_diffusion", "agpd", "agpd_diffusion")
+}
+"""`--policy.type` to the module that registers it."""
 
 FORKSERVER_PRELOAD = ["lerobot_agpd.envs.workers", "lerobot_agpd.plugin", "gymnasium_robotics"]
-"""Imported once, by the forkserver that starts LeRobot's environment workers, instead of by every worker: most of
-a worker's start is LeRobot's imports. What is not installed is skipped."""
+"""Modules that the forkserver of LeRobot's environment workers imports once, instead of every worker: most of a
+worker's start is LeRobot's imports. What is not installed is skipped."""
 
+
+def register(
+    flag: str, registry: type[EnvConfig] | type[PreTrainedConfig], modules: Mapping[str, str]
+) -> None:
+    """Import the modules that register types, each on its own.
+
+    A module that cannot be imported is left out, with a warning that says why.
+
+    Args:
+        flag: command-line flag that selects the type.
+        registry: class that knows the registered types.
+        modules: type to module.
+    """
+    for name, module in modules.items():
+        holder = registry.get_known_choices().get(name)
+        if holder is not None and holder.__module__ != module:
+            logger.warning(
+                "%s=%s of lerobot_policy_agpd is not available: %s of %s has the name already",
+                flag,
+                name,
+                holder.__qualname__,
+                holder.__module__,
+            )
+            continue
+        try:
+            importlib.import_module(module)
+        except Exception:  # one broken module must not cost the other types
+            logger.warning("%s=%s of lerobot_policy_agpd is not available", flag, name, exc_info=True)
+
+
+register("--env.type", EnvConfig, ENV_TYPES)
+register("--policy.type", PreTrainedConfig, POLICY_TYPES)
 multiprocessing.set_forkserver_preload(FORKSERVER_PRELOAD)

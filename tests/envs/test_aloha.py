@@ -4,6 +4,7 @@ import pickle
 import sys
 import warnings
 from dataclasses import dataclass
+from typing import get_args
 
 import draccus
 import gymnasium as gym
@@ -14,7 +15,7 @@ from lerobot.envs import EnvConfig, make_env, preprocess_observation
 from lerobot.envs.utils import env_to_policy_features
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
-from lerobot_agpd.envs.aloha import ALOHA_TASKS, CAMERAS, AlohaStateEnvConfig
+from lerobot_agpd.envs.aloha import ALOHA_TASKS, OBSERVED_KEYS, AlohaStateEnvConfig, Camera, ObsType, Task
 from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS
 
 gym_aloha = pytest.importorskip("gym_aloha")
@@ -94,7 +95,7 @@ def test_cube_between_the_left_fingers_in_the_air_is_a_success():
     assert (reward, terminated, info["is_success"]) == (4.0, True, True)
 
 
-@pytest.mark.parametrize("use_async_envs", [False, True], ids=["sync", "async"])
+@pytest.mark.parametrize("use_async_envs", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_vector_env_agrees_with_the_declared_features(use_async_envs):
     config = AlohaStateEnvConfig(episode_length=2)
     env = make_env(config, n_envs=2, use_async_envs=use_async_envs)["aloha_state"][0]
@@ -141,7 +142,12 @@ def test_the_state_is_at_hand_whatever_is_observed(rendering, obs_type):
 
 def test_the_cameras_are_the_models():
     model = AlohaStateEnvConfig().make_single().unwrapped._env.physics.model
-    assert set(CAMERAS) == {model.id2name(camera, "camera") for camera in range(model.ncam)}
+    assert set(get_args(Camera)) == {model.id2name(camera, "camera") for camera in range(model.ncam)}
+
+
+def test_choices_are_those_of_the_tables():
+    assert get_args(Task) == tuple(ALOHA_TASKS)
+    assert get_args(ObsType) == tuple(OBSERVED_KEYS)
 
 
 def test_command_line_and_round_trip():
@@ -159,7 +165,8 @@ def test_command_line_and_round_trip():
         ({"obs_type": "state"}, "obs_type must be one of environment_state_agent_pos"),
         ({"cameras": ["behind"]}, "behind.*must name at least one of top"),
         ({"cameras": []}, "at least one of top"),
-        ({"fps": 30}, "50 steps per second"),
+        ({"fps": 30}, "fps=30.*50 steps per second"),
+        ({"render_mode": "human"}, "render_mode=human"),
         ({"episode_length": 0}, "episode_length"),
         ({"observation_height": 3}, "observation_height=3"),
     ],

@@ -4,6 +4,7 @@ import pickle
 import sys
 import warnings
 from dataclasses import dataclass
+from typing import get_args
 
 import draccus
 import gymnasium as gym
@@ -16,8 +17,8 @@ from lerobot.envs.utils import check_env_attributes_and_types, env_to_policy_fea
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE
 
 from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE
-from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
-from lerobot_agpd.envs.robotics_tasks import KITCHEN, KITCHEN_DEFAULT, TASKS
+from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv, ObsType, Task
+from lerobot_agpd.envs.robotics_tasks import KITCHEN, KITCHEN_DEFAULT, OBSERVED_KEYS, TASKS
 
 pytest.importorskip("gymnasium_robotics")
 
@@ -64,7 +65,7 @@ def test_gymnasium_env_checker_accepts_pixels(rendering):
 
 
 @pytest.mark.parametrize("task", ["FetchPickAndPlace-v4", "AdroitHandPen-v1", KITCHEN])
-@pytest.mark.parametrize("use_async_envs", [False, True], ids=["sync", "async"])
+@pytest.mark.parametrize("use_async_envs", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_vector_env_agrees_with_the_declared_features(use_async_envs, task):
     config = GymnasiumRoboticsEnv(task=task, episode_length=3)
     env = make_vector_env(config, use_async_envs=use_async_envs)
@@ -100,6 +101,7 @@ def test_vector_env_agrees_with_the_declared_features(use_async_envs, task):
         env.close()
 
 
+@pytest.mark.slow
 def test_vector_env_of_pixels_agrees_with_the_declared_features(rendering):
     config = GymnasiumRoboticsEnv(
         task="FetchReach-v4", obs_type="pixels_agent_pos", observation_height=48, observation_width=64
@@ -130,6 +132,11 @@ def test_seed_determines_the_episode_also_in_a_used_env(task):
     assert not np.array_equal(first, other)
 
 
+def test_choices_are_those_of_the_tables():
+    assert get_args(Task) == tuple(TASKS)
+    assert get_args(ObsType) == tuple(OBSERVED_KEYS)
+
+
 def test_command_line_and_round_trip():
     argv = ["--env.type=gymnasium_robotics", "--env.task=FetchPush-v4", "--env.episode_length=7"]
     config = draccus.parse(Command, args=argv).env
@@ -151,13 +158,14 @@ def test_defaults_follow_the_task():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"task": "FetchDance-v4"}, "FetchDance-v4.*Known tasks: FetchReach-v4, FetchPush-v4"),
+        ({"task": "FetchDance-v4"}, "--env.task .*FetchReach-v4, FetchPush-v4.*FetchDance-v4"),
         ({"obs_type": "depth"}, "obs_type must be one of state, pixels, pixels_agent_pos; got 'depth'"),
         ({"observation_width": 0}, "observation_width=0"),
         ({"tasks_to_complete": ["kettle"]}, "belongs to FrankaKitchen-v1, not to FetchPickAndPlace-v4"),
         ({"task": KITCHEN, "tasks_to_complete": ["laundry"]}, "laundry.*bottom burner"),
         ({"task": KITCHEN, "tasks_to_complete": []}, "at least one of"),
-        ({"fps": 30}, "25 steps per second"),
+        ({"fps": 30}, "fps=30.*25 steps per second"),
+        ({"render_mode": "human"}, "render_mode=human"),
         ({"episode_length": 0}, "episode_length"),
     ],
 )

@@ -62,10 +62,11 @@ def test_pixels_and_state_show_the_same_episode(make):
 
 def test_the_goal_can_be_seen(make):
     """Otherwise no policy could reach it from pixels."""
-    env = make(obs_type="pixels")
-    before = env.reset(seed=0)[0][PIXELS]
+    env = make()
+    env.reset(seed=0)
+    before = env.render()
     env.unwrapped.goal = env.unwrapped.goal + [0.0, 0.1, 0.1]
-    after = env.scene_renderer.render((40, 64))
+    after = env.render()
     assert not np.array_equal(before, after)
 
 

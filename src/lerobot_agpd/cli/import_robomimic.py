@@ -1,13 +1,13 @@
 """`lerobot-agpd-import-robomimic file.hdf5 --root=...`: robomimic's demonstrations as a LeRobotDataset.
 
-What the dataset cannot hold lies beside it: `meta/robomimic.json` says where every episode comes from,
-`meta/robomimic.hdf5` has the recordings in full precision with simulator states and models, for replaying them.
+Beside the dataset, `meta/robomimic.json` says where every episode comes from, and `meta/robomimic.hdf5` has the
+recordings in full precision with simulator states and models, for replaying them.
 """
 
 import json
 import logging
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,11 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_agpd.cli.command import command
 from lerobot_agpd.cli.progress import episode_bar
-from lerobot_agpd.envs.robomimic_columns import RobomimicColumns, cameras_of, task_of
+from lerobot_agpd.dataset_writer import DatasetWriter
+from lerobot_agpd.envs.robomimic_columns import DONES, REWARDS, RobomimicColumns, cameras_of, task_of
 from lerobot_agpd.envs.robomimic_hdf5 import RobomimicFile, sha256
 from lerobot_agpd.envs.robomimic_recordings import RECORDINGS_PATH, copy_recordings
-from lerobot_agpd.envs.shards import Frame, ShardedWriter
+from lerobot_agpd.envs.robomimic_robot import check_robot
 
 logger = logging.getLogger(__name__)
 
@@ -32,19 +33,37 @@ REPORT_PATH = Path("meta/robomimic.json")
 class ImportRobomimicConfig:
     """Options of `lerobot-agpd-import-robomimic`; `--source=` may be left out before the first word."""
 
-    source: Path  # robomimic's file with observations, such as low_dim_v15.hdf5
-    root: Path  # folder of the new dataset; must not exist
-    repo_id: str = "local/robomimic"  # name of the new dataset
-    episodes: list[int] | None = None  # which to keep, e.g. "[0,1]", demo_0 first; default: all
-    filter_key: str | None = None  # keep the demonstrations of this mask of the file, e.g. 20_percent
-    images: bool = False  # import camera images, and not the objects' state
-    cameras: list[str] | None = None  # with --images: which, e.g. "[agentview]"; default: all of the file
-    environment_state: bool | None = None  # import the objects' state; default: unless --images=true
-    video: bool = False  # store images as video, smaller but lossy; default: PNG
-    episodes_per_shard: int = 20  # a killed import goes on, and repeats at most this many episodes
-    push_to_hub: bool = False  # upload the dataset when it is done
+    # robomimic's file with observations, such as low_dim_v15.hdf5
+    source: Path
+    # folder of the new dataset; must not exist
+    root: Path
+    # name of the new dataset
+    repo_id: str = "local/robomimic"
+    # episodes to keep, e.g. "[0,1]", demo_0 first; default: all
+    episodes: list[int] | None = None
+    # keep the demonstrations of this mask of the file, e.g. 20_percent
+    filter_key: str | None = None
+    # import camera images, and not the objects' state
+    images: bool = False
+    # cameras to import with --images=true, e.g. "[agentview]"; default: all of the file
+    cameras: list[str] | None = None
+    # import the objects' state; default: unless --images=true
+    environment_state: bool | None = None
+    # store images as video, smaller but lossy; default: PNG
+    video: bool = False
+    # a killed import goes on, and repeats at most this many episodes
+    episodes_per_shard: int = 20
+    # upload the dataset when it is done
+    push_to_hub: bool = False
 
     def __post_init__(self) -> None:
+        """Check the options.
+
+        Raises:
+            ValueError: if an option is impossible.
+            FileExistsError: if `root` exists.
+            FileNotFoundError: if `source` is not a file.
+        """
         if not self.source.is_file():
             raise FileNotFoundError(f"--source={self.source} is not a file; expected robomimic's .hdf5")
         if self.root.exists():
@@ -58,26 +77,35 @@ class ImportRobomimicConfig:
         if self.episodes_per_shard < 1:
             raise ValueError(f"--episodes_per_shard must be at least 1, got {self.episodes_per_shard}")
 
-    @property
-    def has_environment_state(self) -> bool:
-        """Whether the objects' state is imported: a policy of images should not see it by accident."""
-        return not self.images if self.environment_state is None else self.environment_state
 
-
-def dataset_columns(config: ImportRobomimicConfig, file: RobomimicFile, demo: str) -> RobomimicColumns:
-    """What to import from a file; `demo` tells its cameras.
+def columns_of(config: ImportRobomimicConfig, file: RobomimicFile) -> RobomimicColumns:
+    """Choose and check what to import from a file.
 
     Raises:
-        ValueError: if the file is of another task, or lacks observations or a camera.
+        ValueError: if the file is of another task, or lacks what was requested.
     """
-    file.observation_shapes(demo)  # a file without observations should say so first
-    return RobomimicColumns(
+    demos = file.select(config.episodes, config.filter_key)
+    file.observation_shapes(demos[0])  # raises first for a file without observations
+    task = task_of(file)
+    check_robot(file, task)
+    is_in_file = {key: any(key in file.data[demo] for demo in demos) for key in (REWARDS, DONES)}
+    if lacking := [key for key, present in is_in_file.items() if not present]:
+        logger.warning("%s has no %s: imported without", file.path, " and no ".join(lacking))
+    columns = RobomimicColumns(
         file=file,
-        task=task_of(file),
-        cameras=tuple(cameras_of(file, demo, config.cameras)) if config.images else (),
-        has_environment_state=config.has_environment_state,
+        demos=demos,
+        task=task,
+        cameras=tuple(cameras_of(file, demos[0], config.cameras)) if config.images else (),
+        # A policy of images should not see the objects' state by accident.
+        has_environment_state=not config.images
+        if config.environment_state is None
+        else config.environment_state,
+        has_rewards=is_in_file[REWARDS],
+        has_dones=is_in_file[DONES],
         image_dtype="video" if config.video else "image",
     )
+    columns.check()
+    return columns
 
 
 def provenance(file: RobomimicFile, demos: Sequence[str], digest: str) -> dict[str, Any]:
@@ -112,48 +140,35 @@ def import_robomimic(config: ImportRobomimicConfig) -> LeRobotDataset:
     """Write the dataset, or go on where a killed import of the same file and options stopped.
 
     Raises:
-        ValueError: if the file is damaged, not robomimic's, of an unknown task or without what was asked for.
+        ValueError: if the file is damaged, not robomimic's, of an unknown task or lacks what was requested.
         FileExistsError: if `<root>.partial` holds something else.
         ModuleNotFoundError: if h5py is not installed.
     """
     with RobomimicFile(config.source) as file:
-        demos = file.select(config.episodes, config.filter_key)
-        columns = dataset_columns(config, file, demos[0])
-        file.check(demos, columns.shapes(demos[0]))
+        columns = columns_of(config, file)
+        demos, digest = columns.demos, sha256(config.source)
         warn_about_replays(file, demos)
-        features, digest = columns.features(demos[0]), sha256(config.source)
-        plan = {
-            "source": digest,
-            "repo_id": config.repo_id,
-            "demos": demos,
-            "features": {key: f"{value['dtype']} {list(value['shape'])}" for key, value in features.items()},
-            "episodes_per_shard": config.episodes_per_shard,
-        }
 
-        def create(root: Path) -> LeRobotDataset:
-            return LeRobotDataset.create(
-                config.repo_id, fps=file.fps, features=features, root=root, use_videos=config.video
-            )
-
-        def frames(episode: int) -> Iterator[Frame]:
-            values = columns.read(demos[episode])
-            for step in range(file.length(demos[episode])):
-                frame = {key: column[step] for key, column in values.items()}
-                yield {**frame, "task": columns.task.description}
-
-        def add_provenance(root: Path) -> None:
-            copy_recordings(file, demos, root / RECORDINGS_PATH)
+        def add_provenance(folder: Path) -> None:
+            copy_recordings(file, demos, folder / RECORDINGS_PATH)
             report = provenance(file, demos, digest)
-            (root / REPORT_PATH).write_text(json.dumps(report, indent=2) + "\n")
+            (folder / REPORT_PATH).write_text(json.dumps(report, indent=2) + "\n")
 
-        writer = ShardedWriter(config.root, plan)
+        writer = DatasetWriter(
+            config.root,
+            config.repo_id,
+            file.fps,
+            columns.features,
+            use_videos=config.video,
+            plan={"source": digest, "demos": demos},
+            episodes_per_shard=config.episodes_per_shard,
+        )
         with episode_bar("episodes", len(demos)) as advance:
-            writer.write(len(demos), config.episodes_per_shard, create, frames, advance)
-        return writer.merge(config.repo_id, add_provenance)
+            return writer.write(map(columns.frames, demos), lambda: advance(1), add_provenance)
 
 
 def warn_about_replays(file: RobomimicFile, demos: Sequence[str]) -> None:
-    """Say what will keep the recorded actions from being replayed in the environment type."""
+    """Warn about what keeps the recorded actions from being replayed in the environment type."""
     if not file.is_v15:
         logger.warning(
             "%s was recorded with robosuite %s: the objects' state is put into the order and signs of 1.5, but "

@@ -6,23 +6,28 @@ simulation is in `aloha_sim`.
 
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, Literal, get_args
 
 import gymnasium as gym
-from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import AlohaEnv as LeRobotAlohaEnv, EnvConfig
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_agpd.envs.base import (
     AGENT_POS,
     ENVIRONMENT_STATE,
     PIXELS,
+    RenderMode,
     SingleEnvConfig,
     require_packages,
 )
 
 FPS = 50
-CAMERAS = ("top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist")
+Task = Literal["AlohaTransferCube-v0", "AlohaInsertion-v0"]
+Camera = Literal["top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist"]
+ObsType = Literal[
+    "environment_state_agent_pos", "pixels_agent_pos", "pixels", "pixels_environment_state_agent_pos"
+]
+
 ALOHA_TASKS: dict[str, tuple[str, int]] = {
     "AlohaTransferCube-v0": ("transfer_cube", 1),
     "AlohaInsertion-v0": ("insertion", 2),
@@ -49,7 +54,7 @@ def make_single_env(task: str, episode_length: int, kwargs: dict[str, Any]) -> g
     Raises:
         ModuleNotFoundError: if gym_aloha is not installed.
     """
-    require_packages(["gym_aloha"], "aloha_state", extra="aloha")
+    require_packages(["gym_aloha"], "--env.type=aloha_state", extra="aloha")
     from lerobot_agpd.envs.aloha_sim import AlohaStateEnv
     from lerobot_agpd.envs.workers import TASKS as DESCRIPTIONS, TaskDescription
 
@@ -63,17 +68,31 @@ def make_single_env(task: str, episode_length: int, kwargs: dict[str, Any]) -> g
 class AlohaStateEnvConfig(SingleEnvConfig, LeRobotAlohaEnv):
     """ALOHA's simulated tasks, seen through joints and object poses, or through cameras of any size."""
 
-    task: str | None = "AlohaTransferCube-v0"  # or AlohaInsertion-v0
-    obs_type: str = "environment_state_agent_pos"  # or pixels, pixels_agent_pos, ...
-    observation_height: int = 240  # height of observed images, pixels
-    observation_width: int = 320  # width of observed images, pixels
-    visualization_height: int = 480  # height of rendered frames, pixels
-    visualization_width: int = 640  # width of rendered frames, pixels
-    cameras: list[str] = field(default_factory=lambda: ["top"])  # observed cameras, e.g. "[top,angle]"
-    shadows: bool = True  # draw shadows; without a GPU an image is many times faster without
+    # AlohaTransferCube-v0 or AlohaInsertion-v0
+    task: Task | None = "AlohaTransferCube-v0"
+    # control steps per second; ALOHA has 50 only
+    fps: int = FPS
+    # steps after which an episode is truncated
+    episode_length: int = 400
+    # what is observed
+    obs_type: ObsType = "environment_state_agent_pos"
+    # cameras to observe, e.g. "[top,angle]"
+    cameras: list[Camera] = field(default_factory=lambda: ["top"])
+    # height of observed images, pixels
+    observation_height: int = 240
+    # width of observed images, pixels
+    observation_width: int = 320
+    # height of rendered frames, pixels
+    visualization_height: int = 480
+    # width of rendered frames, pixels
+    visualization_width: int = 640
+    # draw shadows; without a GPU an image is many times faster without
+    shadows: bool = True
+    # gymnasium's render mode; nothing is rendered before `render` is called
+    render_mode: RenderMode = "rgb_array"
 
     def __post_init__(self) -> None:
-        """Derive the features.
+        """Check the options and derive the features.
 
         Raises:
             ValueError: if an option is unknown or impossible.
@@ -81,22 +100,13 @@ class AlohaStateEnvConfig(SingleEnvConfig, LeRobotAlohaEnv):
         if self.task not in ALOHA_TASKS:
             raise ValueError(f"--env.task must be one of {', '.join(ALOHA_TASKS)}; got {self.task!r}.")
         self.check_options(OBSERVED_KEYS, FPS)
-        unknown = [camera for camera in self.cameras if camera not in CAMERAS]
-        if unknown or not self.cameras:
-            raise ValueError(f"--env.cameras={self.cameras} must name at least one of {', '.join(CAMERAS)}.")
+        cameras = get_args(Camera)
+        if not self.cameras or not set(self.cameras) <= set(cameras):
+            raise ValueError(f"--env.cameras={self.cameras} must name at least one of {', '.join(cameras)}.")
         keys = OBSERVED_KEYS[self.obs_type]
-        image = PolicyFeature(FeatureType.VISUAL, (self.observation_height, self.observation_width, 3))
-        self.features = {ACTION: PolicyFeature(FeatureType.ACTION, (14,))}
-        self.features_map = {ACTION: ACTION, AGENT_POS: OBS_STATE, ENVIRONMENT_STATE: OBS_ENV_STATE}
-        if AGENT_POS in keys:
-            self.features[AGENT_POS] = PolicyFeature(FeatureType.STATE, (14,))
-        if ENVIRONMENT_STATE in keys:
-            self.features[ENVIRONMENT_STATE] = PolicyFeature(
-                FeatureType.ENV, (7 * ALOHA_TASKS[self.task][1],)
-            )
-        for camera in self.cameras if PIXELS in keys else ():
-            self.features[f"{PIXELS}/{camera}"] = image
-            self.features_map[f"{PIXELS}/{camera}"] = f"{OBS_IMAGES}.{camera}"
+        image_keys = {f"{PIXELS}/{camera}": f"{OBS_IMAGES}.{camera}" for camera in self.cameras}
+        _, n_objects = ALOHA_TASKS[self.task]
+        self.set_features(keys, 14, 14, 7 * n_objects, image_keys if PIXELS in keys else {})
 
     @property
     def package_name(self) -> str:
@@ -119,6 +129,5 @@ class AlohaStateEnvConfig(SingleEnvConfig, LeRobotAlohaEnv):
 
     @property
     def factory(self) -> partial[gym.Env]:
-        """Builds one environment; see `make_single_env`."""
-        assert self.episode_length is not None  # checked by __post_init__
+        """Function that builds one environment; see `make_single_env`."""
         return partial(make_single_env, str(self.task), self.episode_length, self.gym_kwargs)

@@ -45,7 +45,7 @@ class AlohaStateEnv(AlohaEnv):
     """`gym_aloha.env.AlohaEnv` that observes the keys it is told to.
 
     `agent_pos` (14,) holds the joint positions of the left and the right arm, radians, each followed by its gripper's
-    opening in [0, 1]; `environment_state` one pose (7,) per object: position, metres, and quaternion, w first;
+    opening in [0, 1]; `environment_state` one pose (7,) per object: position, meters, and quaternion, w first;
     `pixels` one image (height, width, 3) per camera.
     """
 

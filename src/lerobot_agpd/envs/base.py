@@ -1,12 +1,15 @@
-"""What the environment types share: raw observation keys, how one environment is built and how many."""
+"""What the environment types share: raw observation keys, options, features, and how environments are built."""
 
 import importlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Literal
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 AGENT_POS = "agent_pos"
 ENVIRONMENT_STATE = "environment_state"
@@ -44,26 +47,30 @@ def make_vector_env(factory: Callable[[], gym.Env], n_envs: int, use_async_envs:
     return SyncVectorEnv(factories, autoreset_mode=AutoresetMode.SAME_STEP)
 
 
-def require_packages(names: Sequence[str], env_type: str, extra: str) -> None:
-    """Import packages that an optional extra of this one installs.
+def require_packages(names: Sequence[str], user: str, extra: str) -> None:
+    """Import packages that an optional extra installs.
 
     Args:
-        names: the packages; importing them registers their environments.
-        env_type: who needs them.
-        extra: that brings them.
+        names: packages; importing them registers their environments.
+        user: what needs them, for the message.
+        extra: name of the extra.
 
     Raises:
-        ModuleNotFoundError: naming the extra, if one of them or something that it needs is not installed.
+        ModuleNotFoundError: naming the extra, if one of them or one of their requirements is not installed.
     """
     try:
         for name in names:
             importlib.import_module(name)
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
-            f"The {env_type} environments need the package {error.name!r}, which is not installed. "
+            f"{user} needs the package {error.name!r}, which is not installed. "
             f"Run: pip install 'lerobot_policy_agpd[{extra}]'",
             name=error.name,
         ) from error
+
+
+RenderMode = Literal["rgb_array"]
+"""Values of `--env.render_mode`. An alias, since draccus finds no comment of a field with quotes in its annotation."""
 
 
 class SingleEnvConfig(ABC):
@@ -73,28 +80,37 @@ class SingleEnvConfig(ABC):
     type: str
     task: str | None
     fps: int | None
+    features: dict[str, PolicyFeature]
+    features_map: dict[str, str]
     # Of every type here:
     obs_type: str
     episode_length: int | None
+    render_mode: str
     observation_height: int
     observation_width: int
 
-    def check_options(self, obs_types: Collection[str], fps: int, episode_length: int | None = None) -> None:
-        """Check what every type has, and fill in what the task decides where it was left at None.
+    def check_options(
+        self, observed_keys: Mapping[str, tuple[str, ...]], fps: int, episode_length: int | None = None
+    ) -> None:
+        """Check the options of every type, and fill in what the task decides where it is None.
 
         Args:
-            obs_types: the known ones.
-            fps: the simulation's, control steps per second.
+            observed_keys: raw keys of every `obs_type`.
+            fps: the simulation's control steps per second.
             episode_length: the task's own limit, if it has one.
 
         Raises:
-            ValueError: naming the option that cannot be.
+            ValueError: naming the option that is impossible.
         """
-        if self.obs_type not in obs_types:
-            raise ValueError(f"--env.obs_type must be one of {', '.join(obs_types)}; got {self.obs_type!r}.")
+        if self.obs_type not in observed_keys:
+            raise ValueError(
+                f"--env.obs_type must be one of {', '.join(observed_keys)}; got {self.obs_type!r}."
+            )
+        if self.render_mode != "rgb_array":
+            raise ValueError(f"--env.render_mode={self.render_mode}: only rgb_array can be rendered.")
         self.fps = fps if self.fps is None else self.fps
         if self.fps != fps:
-            raise ValueError(f"{self.task} runs at {fps} steps per second; --env.fps={self.fps} cannot be.")
+            raise ValueError(f"--env.fps={self.fps}: {self.task} runs at {fps} steps per second.")
         self.episode_length = episode_length if self.episode_length is None else self.episode_length
         if self.episode_length is None or self.episode_length < 1:
             raise ValueError(f"--env.episode_length must be at least 1, got {self.episode_length}.")
@@ -104,13 +120,45 @@ class SingleEnvConfig(ABC):
                 f"{self.observation_width} must be at least 4 pixels."
             )
 
+    def set_features(
+        self,
+        keys: Sequence[str],
+        action_dim: int,
+        agent_pos_dim: int,
+        environment_state_dim: int,
+        image_keys: Mapping[str, str],
+    ) -> None:
+        """Declare the action and what is observed.
+
+        Args:
+            keys: observed raw keys.
+            action_dim: length of an action.
+            agent_pos_dim: length of `agent_pos`.
+            environment_state_dim: length of `environment_state`.
+            image_keys: raw key of every image to its LeRobot key.
+        """
+        self.features = {ACTION: PolicyFeature(FeatureType.ACTION, (action_dim,))}
+        self.features_map = {
+            ACTION: ACTION,
+            AGENT_POS: OBS_STATE,
+            ENVIRONMENT_STATE: OBS_ENV_STATE,
+            **image_keys,
+        }
+        if AGENT_POS in keys:
+            self.features[AGENT_POS] = PolicyFeature(FeatureType.STATE, (agent_pos_dim,))
+        if ENVIRONMENT_STATE in keys:
+            self.features[ENVIRONMENT_STATE] = PolicyFeature(FeatureType.ENV, (environment_state_dim,))
+        if PIXELS in keys:
+            shape = (self.observation_height, self.observation_width, 3)
+            self.features |= {key: PolicyFeature(FeatureType.VISUAL, shape) for key in image_keys}
+
     @property
     @abstractmethod
     def factory(self) -> Callable[[], gym.Env]:
-        """Builds one environment; picklable, for worker processes that have imported nothing yet."""
+        """Function that builds one environment; picklable, for worker processes that have imported nothing yet."""
 
     def make_single(self) -> gym.Env:
-        """Build one environment outside any vector environment."""
+        """Build one environment."""
         return self.factory()
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:

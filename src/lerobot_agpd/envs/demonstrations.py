@@ -1,19 +1,19 @@
-"""Episodes of a scripted expert as dataset frames, and the count of what happened to the attempts."""
+"""Successful episodes of a scripted expert as dataset frames, and the count of what happened to the attempts."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from lerobot.utils.constants import ACTION, DONE, REWARD, SUCCESS
 from lerobot.utils.utils import flatten_dict
-from rich.table import Table
 
-from lerobot_agpd.analysis.statistics import Estimate, success_rate
-from lerobot_agpd.envs.experts.base import Observation
+from lerobot_agpd.dataset_writer import Frame
+from lerobot_agpd.envs.experts.base import Expert, Observation
+from lerobot_agpd.envs.operators import Operator
 
-Frame = dict[str, Any]
+SKILL = "skill"
+"""Feature of datasets whose operators are not all experts: the skill of the frame's operator."""
 
 
 @dataclass
@@ -23,7 +23,7 @@ class DemosReport:
     Attributes:
         task: the environment's task.
         seeds: environment seed of every recorded episode, in order.
-        trivial_seeds: seeds skipped because the goal was reached before the first step.
+        solved_at_start_seeds: seeds skipped because the goal was reached before the first step.
         failed_seeds: seeds whose goal was not reached at the last step.
         skills: skill of every recorded episode, in order.
         failed_skills: skill of every failed one.
@@ -32,7 +32,7 @@ class DemosReport:
 
     task: str
     seeds: list[int] = field(default_factory=list)
-    trivial_seeds: list[int] = field(default_factory=list)
+    solved_at_start_seeds: list[int] = field(default_factory=list)
     failed_seeds: list[int] = field(default_factory=list)
     skills: list[float] = field(default_factory=list)
     failed_skills: list[float] = field(default_factory=list)
@@ -40,56 +40,8 @@ class DemosReport:
 
     @property
     def attempts(self) -> int:
-        """Episodes begun, those with a trivial start included."""
-        return len(self.seeds) + len(self.trivial_seeds) + len(self.failed_seeds)
-
-    @property
-    def operators(self) -> list[float]:
-        """Skills that were played, the best first."""
-        return sorted({*self.skills, *self.failed_skills}, reverse=True)
-
-    def success_rate(self, skill: float | None = None) -> Estimate:
-        """Share of episodes with the goal reached at the last step, without trivial starts, with Wilson's interval.
-
-        Episodes are played until enough succeed, so the last one always does; over few episodes that flatters.
-
-        Args:
-            skill: of the operator whose episodes count; all by default.
-
-        Raises:
-            ValueError: if no such episode was played.
-        """
-        if skill is None:
-            return _share(len(self.seeds), len(self.failed_seeds))
-        return _share(self.skills.count(skill), self.failed_skills.count(skill))
-
-    @property
-    def recorded_share(self) -> Estimate:
-        """Recorded episodes per attempt, trivial starts included, with Wilson's interval."""
-        return _share(len(self.seeds), self.attempts - len(self.seeds))
-
-    def to_table(self) -> Table:
-        """Lay the counts out for the console."""
-        table = Table("scripted expert", self.task)
-        table.add_row("attempts", str(self.attempts))
-        table.add_row("skipped: goal reached at the start", str(len(self.trivial_seeds)))
-        table.add_row("dropped: failed", str(len(self.failed_seeds)))
-        table.add_row("recorded episodes", str(len(self.seeds)))
-        table.add_row("recorded frames", str(self.frames))
-        table.add_row("recorded per attempt", _with_count(self.recorded_share))
-        table.add_row("success rate without trivial starts", _with_count(self.success_rate()))
-        for skill in self.operators if self.operators != [1.0] else []:
-            table.add_row(f"  skill {skill:g}", _with_count(self.success_rate(skill)))
-        return table
-
-
-def _share(successes: int, failures: int) -> Estimate:
-    return success_rate([True] * successes + [False] * failures)
-
-
-def _with_count(estimate: Estimate) -> str:
-    """E.g. `0.91 [0.86, 0.94], N = 120`."""
-    return f"{estimate}, N = {estimate.n}"
+        """Episodes begun, those that were solved at the start included."""
+        return len(self.seeds) + len(self.solved_at_start_seeds) + len(self.failed_seeds)
 
 
 def play_episode(
@@ -116,9 +68,61 @@ def play_episode(
         frame = {features_map[key]: value for key, value in flatten_dict(observation).items()}
         observation, reward, terminated, truncated, info = env.step(action)
         done = terminated or truncated
+        frame["task"] = env.get_wrapper_attr("task_description")
         frame[ACTION] = action
         frame[REWARD] = np.array([reward], dtype=np.float32)
         frame[SUCCESS] = np.array([info["is_success"]], dtype=bool)
         frame[DONE] = np.array([done], dtype=bool)
         frames.append(frame)
     return frames
+
+
+def successful_episodes(
+    env: gym.Env,
+    expert: Expert,
+    features_map: dict[str, str],
+    skills: Sequence[float],
+    n_episodes: int,
+    seeds: range,
+    report: DemosReport,
+) -> Iterator[list[Frame]]:
+    """Play seed after seed and yield episodes whose goal is reached at the last step.
+
+    Operators take turns: the same one plays until an episode succeeds. Their noise follows from the first seed and the
+    seed of the episode.
+
+    Args:
+        env: see `play_episode`.
+        expert: of the environment's task.
+        features_map: raw key to dataset key.
+        skills: one skill per operator; `[1.0]` is the expert alone, without the feature `skill`.
+        n_episodes: episodes to yield.
+        seeds: environment seeds to try.
+        report: updated on the way.
+
+    Raises:
+        RuntimeError: if too few episodes succeed.
+    """
+    for seed in seeds:
+        skill = skills[len(report.seeds) % len(skills)]
+        operator = Operator(expert, skill, np.random.default_rng([seeds[0], seed]))
+        frames = play_episode(env, operator, seed, features_map)
+        if frames is None:
+            report.solved_at_start_seeds.append(seed)
+        elif not frames[-1][SUCCESS].item():
+            report.failed_seeds.append(seed)
+            report.failed_skills.append(skill)
+        else:
+            report.seeds.append(seed)
+            report.skills.append(skill)
+            report.frames += len(frames)
+            if list(skills) != [1.0]:
+                frames = [{**frame, SKILL: np.array([skill], dtype=np.float32)} for frame in frames]
+            yield frames
+            if len(report.seeds) == n_episodes:
+                return
+    raise RuntimeError(
+        f"Only {len(report.seeds)} of {n_episodes} episodes succeeded in {report.attempts} attempts "
+        f"({len(report.solved_at_start_seeds)} solved at the start, {len(report.failed_seeds)} failed), seeds "
+        f"{seeds.start} to {seeds.stop - 1}. A less skilled operator needs a larger --env.episode_length."
+    )

@@ -2,7 +2,7 @@
 
 Observations are split into LeRobot's raw keys:
 
-- `agent_pos`: what the robot knows of itself (becomes `observation.state`);
+- `agent_pos`: joints and gripper of the robot (becomes `observation.state`);
 - `environment_state`: objects and, where there is one, the desired goal (becomes `observation.environment_state`);
 - `pixels`: one camera image (becomes `observation.image`).
 
@@ -11,27 +11,37 @@ The tasks are in `robotics_tasks`, the wrapper in `robotics_wrapper`.
 
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, Literal, get_args
 
 import gymnasium as gym
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs import PolicyFeature
 from lerobot.envs.configs import EnvConfig
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE
+from lerobot.utils.constants import OBS_IMAGE
 
-from lerobot_agpd.envs.base import (
-    AGENT_POS,
-    ENVIRONMENT_STATE,
-    PIXELS,
-    SingleEnvConfig,
-    require_packages,
-)
-from lerobot_agpd.envs.robotics_tasks import (
-    KITCHEN,
-    KITCHEN_DEFAULT,
-    KITCHEN_TASKS,
-    OBSERVED_KEYS,
-    get_task_spec,
-)
+from lerobot_agpd.envs.base import PIXELS, RenderMode, SingleEnvConfig, require_packages
+from lerobot_agpd.envs.robotics_tasks import KITCHEN, KITCHEN_DEFAULT, OBSERVED_KEYS, get_task
+
+Task = Literal[
+    "FetchReach-v4",
+    "FetchPush-v4",
+    "FetchPickAndPlace-v4",
+    "FetchSlide-v4",
+    "AdroitHandDoor-v1",
+    "AdroitHandHammer-v1",
+    "AdroitHandPen-v1",
+    "AdroitHandRelocate-v1",
+    "FrankaKitchen-v1",
+]
+ObsType = Literal["state", "pixels", "pixels_agent_pos"]
+KitchenTask = Literal[
+    "bottom burner",
+    "top burner",
+    "light switch",
+    "slide cabinet",
+    "hinge cabinet",
+    "microwave",
+    "kettle",
+]
 
 
 def make_single_env(
@@ -58,7 +68,7 @@ def make_single_env(
         ModuleNotFoundError: if Gymnasium-Robotics is not installed.
         ValueError: if the task is not known.
     """
-    require_packages(["gymnasium_robotics", "mujoco"], "gymnasium_robotics", extra="fetch")
+    require_packages(["gymnasium_robotics", "mujoco"], "--env.type=gymnasium_robotics", extra="fetch")
     from lerobot_agpd.envs.robotics_wrapper import RoboticsWrapper, View
 
     view = View(obs_type, observation_size, visualization_size, shadows)
@@ -70,28 +80,32 @@ def make_single_env(
 class GymnasiumRoboticsEnv(SingleEnvConfig, EnvConfig):
     """Tasks of Gymnasium-Robotics, seen through their state or one camera."""
 
-    task: str | None = "FetchPickAndPlace-v4"  # FetchReach-v4, ..., AdroitHandDoor-v1, ..., FrankaKitchen-v1
-    fps: int | None = None  # control steps per second; the simulation allows its own only (None)
-    episode_length: int | None = None  # steps after which an episode is truncated; None: the task's own limit
-    obs_type: str = "state"  # state, pixels or pixels_agent_pos
-    observation_width: int = 96  # width of observed images, pixels
-    observation_height: int = 96  # height of observed images, pixels
-    render_mode: str = "rgb_array"  # gymnasium's render mode; nothing is rendered unless asked for
-    visualization_width: int = 480  # width of rendered frames, pixels
-    visualization_height: int = 480  # height of rendered frames, pixels
-    shadows: bool = True  # draw shadows; without a GPU Adroit's images are several times faster without
-    tasks_to_complete: list[str] | None = (
-        None  # FrankaKitchen-v1 only: what success asks for, e.g. "[kettle]"
-    )
-    features: dict[str, PolicyFeature] = field(default_factory=dict)  # derived from the task
-    features_map: dict[str, str] = field(
-        default_factory=lambda: {
-            ACTION: ACTION,
-            AGENT_POS: OBS_STATE,
-            ENVIRONMENT_STATE: OBS_ENV_STATE,
-            PIXELS: OBS_IMAGE,
-        }
-    )  # raw key to LeRobot key
+    # task of Gymnasium-Robotics
+    task: Task | None = "FetchPickAndPlace-v4"
+    # control steps per second; default: the task's, the only possible value
+    fps: int | None = None
+    # steps after which an episode is truncated; default: the task's own limit
+    episode_length: int | None = None
+    # what is observed
+    obs_type: ObsType = "state"
+    # width of observed images, pixels
+    observation_width: int = 96
+    # height of observed images, pixels
+    observation_height: int = 96
+    # gymnasium's render mode; nothing is rendered before `render` is called
+    render_mode: RenderMode = "rgb_array"
+    # width of rendered frames, pixels
+    visualization_width: int = 480
+    # height of rendered frames, pixels
+    visualization_height: int = 480
+    # draw shadows; without a GPU Adroit's images are several times faster without
+    shadows: bool = True
+    # FrankaKitchen-v1 only: the tasks that make a success, e.g. "[kettle]"; default: D4RL's kitchen-complete
+    tasks_to_complete: list[KitchenTask] | None = None
+    # derived from the task
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    # raw key to LeRobot key, derived from the task
+    features_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Fill in what depends on the task and derive the features.
@@ -99,17 +113,14 @@ class GymnasiumRoboticsEnv(SingleEnvConfig, EnvConfig):
         Raises:
             ValueError: if an option is unknown or does not fit the task.
         """
-        spec = get_task_spec(self.task)
-        self.check_options(OBSERVED_KEYS, spec.fps, spec.episode_length)
+        task = get_task(self.task)
+        self.check_options(OBSERVED_KEYS, task.fps, task.episode_length)
         self._check_kitchen_tasks()
-        shapes = {
-            AGENT_POS: (FeatureType.STATE, (spec.layout.agent_pos_dim,)),
-            ENVIRONMENT_STATE: (FeatureType.ENV, (spec.layout.environment_state_dim,)),
-            PIXELS: (FeatureType.VISUAL, (self.observation_height, self.observation_width, 3)),
-        }
-        self.features = {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(spec.action_dim,))}
-        for key in OBSERVED_KEYS[self.obs_type]:
-            self.features[key] = PolicyFeature(type=shapes[key][0], shape=shapes[key][1])
+        keys, layout = OBSERVED_KEYS[self.obs_type], task.layout
+        image_keys = {PIXELS: OBS_IMAGE}
+        self.set_features(
+            keys, task.action_dim, layout.agent_pos_dim, layout.environment_state_dim, image_keys
+        )
 
     def _check_kitchen_tasks(self) -> None:
         if self.task != KITCHEN:
@@ -120,11 +131,10 @@ class GymnasiumRoboticsEnv(SingleEnvConfig, EnvConfig):
             return
         if self.tasks_to_complete is None:
             self.tasks_to_complete = list(KITCHEN_DEFAULT)
-        unknown = [task for task in self.tasks_to_complete if task not in KITCHEN_TASKS]
-        if unknown or not self.tasks_to_complete:
+        tasks = get_args(KitchenTask)
+        if not self.tasks_to_complete or not set(self.tasks_to_complete) <= set(tasks):
             raise ValueError(
-                f"--env.tasks_to_complete={self.tasks_to_complete} must name at least one of "
-                f"{', '.join(KITCHEN_TASKS)}."
+                f"--env.tasks_to_complete={self.tasks_to_complete} must name at least one of {', '.join(tasks)}."
             )
 
     @property
@@ -153,7 +163,7 @@ class GymnasiumRoboticsEnv(SingleEnvConfig, EnvConfig):
 
     @property
     def factory(self) -> partial[gym.Env]:
-        """Builds one environment; see `make_single_env`."""
+        """Function that builds one environment; see `make_single_env`."""
         return partial(
             make_single_env,
             self.gym_id,

@@ -1,8 +1,8 @@
 """Operators of limited skill: a scripted expert that hesitates, trembles, takes detours, makes mistakes and recovers.
 
 What an operator *intends* stays a pure function of the observation: the expert's action, slower and on a bent path.
-What chance adds on top (tremor, pauses, slips) is noise that no observation shows, as with people. A mistake is never
-a plan: after a slip of a few steps the expert sees where things are now and carries on from there.
+Tremor, pauses and slips are noise on top, which no observation shows, as with people. After a slip of a few steps the
+expert goes on from the new situation.
 
 Human data mix operators in the same way; the multi-human sets of robomimic (arXiv:2108.03298) are the model for a list
 of skills.
@@ -14,27 +14,35 @@ import numpy as np
 
 from lerobot_agpd.envs.experts.base import Array, Expert, Observation
 
-# All of these are reached at skill 0 and fall linearly to nothing at skill 1.
-SLOWNESS = 0.3  # share of the speed that is lost
-DETOUR_ANGLE = math.radians(60)  # largest turn of the horizontal heading
-DETOUR_WAVELENGTH = 0.20  # metres of hand travel after which the turn repeats
-TREMOR = 0.3  # standard deviation of the noise on the motion, action units
-PAUSE_RATE = 0.05  # pauses begun per step
-SLIP_RATE = 0.04  # slips begun per step
+# Values at skill 0; all fall linearly to nothing at skill 1.
+# Fraction of the speed that is lost.
+SLOWNESS = 0.3
+# Largest turn of the horizontal heading.
+DETOUR_ANGLE = math.radians(60)
+# Meters of hand travel after which the turn repeats.
+DETOUR_WAVELENGTH = 0.20
+# Standard deviation of the noise on the motion, action units.
+TREMOR = 0.3
+# Pauses begun per step.
+PAUSE_RATE = 0.05
+# Slips begun per step.
+SLIP_RATE = 0.04
 
-TREMOR_CORRELATION = 0.7  # from one step to the next
-PAUSE_STEPS = (2, 6)  # shortest and longest
+# Correlation of the tremor from one step to the next.
+TREMOR_CORRELATION = 0.7
+# Shortest and longest pause and slip.
+PAUSE_STEPS = (2, 6)
 SLIP_STEPS = (2, 5)
 
 
 def bent_path(action: Array, hand: Array, skill: float) -> Array:
     """Slow an action down and turn its horizontal heading by an angle that depends on where the hand is.
 
-    The angle stays below 90 degrees: every step still gets closer to where the expert wanted to go.
+    The angle stays below 90 degrees: every step still gets closer to the expert's goal.
 
     Args:
         action: (4,) displacement x, y, z in [-1, 1], and gripper.
-        hand: (3,) position of the hand, metres.
+        hand: (3,) position of the hand, meters.
         skill: 1 returns the action unchanged, 0 bends it most.
 
     Returns:
@@ -44,24 +52,19 @@ def bent_path(action: Array, hand: Array, skill: float) -> Array:
     phase = 2 * math.pi * (hand[0] + hand[1]) / DETOUR_WAVELENGTH
     turn = lapse * DETOUR_ANGLE * math.sin(phase)
     x, y = action[:2]
-    turned = np.array(
-        [
-            math.cos(turn) * x - math.sin(turn) * y,
-            math.sin(turn) * x + math.cos(turn) * y,
-            action[2],
-        ]
-    )
+    cos, sin = math.cos(turn), math.sin(turn)
+    turned = np.array([cos * x - sin * y, sin * x + cos * y, action[2]])
     return np.append((1.0 - SLOWNESS * lapse) * turned, action[3])
 
 
 class Lapses:
-    """What chance does to one hand: tremor, pauses and slips."""
+    """Random lapses of one hand: tremor, pauses and slips."""
 
     def __init__(self, lapse: float, rng: np.random.Generator) -> None:
         """Begin an episode.
 
         Args:
-            lapse: what is lacking of full skill, in [0, 1].
+            lapse: 1 minus the skill, in [0, 1].
             rng: source of tremor, pauses and slips.
         """
         self._lapse = lapse
@@ -72,7 +75,7 @@ class Lapses:
         self._slip_intention: Array = np.zeros(4)
 
     def disturb(self, intention: Array) -> Array:
-        """One step: what the hand (4,) does instead."""
+        """Return the action (4,) of the hand instead of its intention (4,), for one step."""
         intention = self._slip(self._pause(intention))
         return intention + np.append(self._next_tremor(), 0.0)
 
@@ -117,7 +120,7 @@ class Operator:
         Args:
             expert: whose intentions are carried out.
             skill: in [0, 1].
-            rng: source of what is left to chance.
+            rng: source of tremor, pauses and slips.
 
         Raises:
             ValueError: if the skill is outside [0, 1].

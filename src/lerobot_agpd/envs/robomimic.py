@@ -1,4 +1,4 @@
-"""LeRobot environment type `robomimic`: the simulated tasks of robomimic (arXiv:2108.03298) in robosuite 1.5.
+"""LeRobot environment type `robosuite_robomimic`: the simulated tasks of robomimic (arXiv:2108.03298) in robosuite 1.5.
 
 The raw keys become `observation.state`, `observation.environment_state` and `observation.images.<camera>`. The tasks
 are in `robomimic_tasks`, the simulation in `robosuite_sim`.
@@ -6,21 +6,18 @@ are in `robomimic_tasks`, the simulation in `robosuite_sim`.
 
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs import PolicyFeature
 from lerobot.envs.configs import EnvConfig
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import OBS_IMAGES
 
-from lerobot_agpd.envs.base import (
-    AGENT_POS,
-    ENVIRONMENT_STATE,
-    PIXELS,
-    SingleEnvConfig,
-    require_packages,
-)
+from lerobot_agpd.envs.base import PIXELS, RenderMode, SingleEnvConfig, require_packages
 from lerobot_agpd.envs.robomimic_tasks import FPS, OBSERVED_KEYS, get_task
+
+Task = Literal["lift", "can", "square", "transport", "tool_hang"]
+ObsType = Literal["state", "pixels_agent_pos", "pixels"]
 
 
 def make_single_env(task: str, episode_length: int, view_kwargs: dict[str, Any], render_mode: str) -> gym.Env:
@@ -36,34 +33,44 @@ def make_single_env(task: str, episode_length: int, view_kwargs: dict[str, Any],
         ModuleNotFoundError: if robosuite is not installed.
     """
     # Our module first: it silences robosuite's warnings before it imports robosuite.
-    require_packages(["lerobot_agpd.envs.robosuite_sim", "robosuite"], "robomimic", extra="robomimic")
+    require_packages(
+        ["lerobot_agpd.envs.robosuite_sim", "robosuite"], "--env.type=robosuite_robomimic", extra="robomimic"
+    )
     from lerobot_agpd.envs.robosuite_sim import RobosuiteEnv, View
 
     env = RobosuiteEnv(task, View(**view_kwargs), render_mode)
     return gym.wrappers.TimeLimit(env, episode_length)
 
 
-@EnvConfig.register_subclass("robomimic")
+@EnvConfig.register_subclass("robosuite_robomimic")
 @dataclass
 class RobomimicEnvConfig(SingleEnvConfig, EnvConfig):
     """Tasks of robomimic with one Panda, or two, seen through their state or through cameras."""
 
-    task: str | None = "lift"  # lift, can, square, transport or tool_hang
-    fps: int = FPS  # control steps per second; robomimic has 20 only
-    episode_length: int | None = None  # steps after which an episode is truncated; None: robomimic's horizon
-    obs_type: str = "state"  # state, pixels_agent_pos or pixels
-    cameras: list[str] | None = (
-        None  # observed cameras, e.g. "[agentview]"; None: those of robomimic's datasets
-    )
-    observation_height: int = 84  # height of observed images, pixels; robomimic has 240 for tool_hang
-    observation_width: int = 84  # width of observed images, pixels
-    visualization_height: int = 480  # height of rendered frames, pixels
-    visualization_width: int = 480  # width of rendered frames, pixels
-    render_mode: str = "rgb_array"  # gymnasium's render mode; nothing is rendered unless asked for
-    features: dict[str, PolicyFeature] = field(default_factory=dict)  # derived from the task
-    features_map: dict[str, str] = field(
-        default_factory=dict
-    )  # raw key to LeRobot key, derived from the task
+    # task of robomimic
+    task: Task | None = "lift"
+    # control steps per second; robomimic has 20 only
+    fps: int = FPS
+    # steps after which an episode is truncated; default: robomimic's horizon for its proficient-human data
+    episode_length: int | None = None
+    # what is observed
+    obs_type: ObsType = "state"
+    # cameras to observe, e.g. "[agentview]"; default: those of robomimic's image datasets
+    cameras: list[str] | None = None
+    # height of observed images, pixels; robomimic has 240 for tool_hang
+    observation_height: int = 84
+    # width of observed images, pixels
+    observation_width: int = 84
+    # height of rendered frames, pixels
+    visualization_height: int = 480
+    # width of rendered frames, pixels
+    visualization_width: int = 480
+    # gymnasium's render mode; nothing is rendered before `render` is called
+    render_mode: RenderMode = "rgb_array"
+    # derived from the task
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    # raw key to LeRobot key, derived from the task
+    features_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Fill in what depends on the task and derive the features.
@@ -73,30 +80,21 @@ class RobomimicEnvConfig(SingleEnvConfig, EnvConfig):
         """
         task = get_task(self.task)
         self.check_options(OBSERVED_KEYS, FPS, task.episode_length)
-        if self.render_mode != "rgb_array":
-            raise ValueError(f"--env.render_mode={self.render_mode}: only rgb_array can be rendered.")
         if self.cameras is None:
             self.cameras = list(task.cameras)
-        known = (*task.cameras, *task.more_cameras)
-        if not self.cameras or not set(self.cameras) <= set(known):
+        cameras = (*task.cameras, *task.more_cameras)
+        if not self.cameras or not set(self.cameras) <= set(cameras):
             raise ValueError(
-                f"--env.cameras={self.cameras} must name at least one of {', '.join(known)} for {self.task}."
+                f"--env.cameras={self.cameras} must name at least one of {', '.join(cameras)} for {self.task}."
             )
-        self._derive_features()
-
-    def _derive_features(self) -> None:
-        task = get_task(self.task)
-        keys = OBSERVED_KEYS[self.obs_type]
-        image = PolicyFeature(FeatureType.VISUAL, (self.observation_height, self.observation_width, 3))
-        self.features = {ACTION: PolicyFeature(FeatureType.ACTION, (task.action_dim,))}
-        self.features_map = {ACTION: ACTION, AGENT_POS: OBS_STATE, ENVIRONMENT_STATE: OBS_ENV_STATE}
-        if AGENT_POS in keys:
-            self.features[AGENT_POS] = PolicyFeature(FeatureType.STATE, (task.agent_pos_dim,))
-        if ENVIRONMENT_STATE in keys:
-            self.features[ENVIRONMENT_STATE] = PolicyFeature(FeatureType.ENV, (task.environment_state_dim,))
-        for camera in self._observed_cameras:
-            self.features[f"{PIXELS}/{camera}"] = image
-            self.features_map[f"{PIXELS}/{camera}"] = f"{OBS_IMAGES}.{camera}"
+        image_keys = {f"{PIXELS}/{camera}": f"{OBS_IMAGES}.{camera}" for camera in self._observed_cameras}
+        self.set_features(
+            OBSERVED_KEYS[self.obs_type],
+            task.action_dim,
+            task.agent_pos_dim,
+            task.environment_state_dim,
+            image_keys,
+        )
 
     @property
     def _observed_cameras(self) -> tuple[str, ...]:
@@ -119,7 +117,7 @@ class RobomimicEnvConfig(SingleEnvConfig, EnvConfig):
 
     @property
     def factory(self) -> partial[gym.Env]:
-        """Builds one environment; see `make_single_env`."""
+        """Function that builds one environment; see `make_single_env`."""
         assert self.episode_length is not None  # filled in by __post_init__
         return partial(
             make_single_env, str(self.task), self.episode_length, self.gym_kwargs, self.render_mode

@@ -62,7 +62,7 @@ class RobomimicFile:
             ValueError: if it is not HDF5, damaged, or not robomimic's.
             ModuleNotFoundError: if h5py is not installed.
         """
-        require_packages(["h5py"], "robomimic", extra="robomimic")
+        require_packages(["h5py"], f"{path}, an HDF5 file,", extra="robomimic")
         import h5py
 
         self.path = path
@@ -115,11 +115,9 @@ class RobomimicFile:
             raise ValueError(f"{self.path}: env_kwargs.{key} must be a positive number, found {value}")
         return float(value)
 
-    # ---- what the environment was ----
-
     @property
     def is_v15(self) -> bool:
-        """Whether robosuite 1.5 or later made it; old files without `env_version` show it by nested controllers."""
+        """Whether robosuite 1.5 or later made it; in files without `env_version` nested controllers tell."""
         version = self.env_args.get("env_version")
         if version is None:
             return "body_parts" in self.env_args["env_kwargs"].get("controller_configs", {})
@@ -134,10 +132,8 @@ class RobomimicFile:
         """Index into `operators`; -1 if no mask names this demonstration."""
         return next((i for i, key in enumerate(self.operators) if demo in self.masks[key]), -1)
 
-    # ---- demonstrations ----
-
     def select(self, episodes: Sequence[int] | None, filter_key: str | None) -> list[str]:
-        """Names of the demonstrations asked for, by position or by mask; all if neither is given.
+        """Names of the requested demonstrations, by position or by mask; all if neither is given.
 
         Raises:
             ValueError: naming the flag, if the file has no such demonstration or mask.
@@ -150,6 +146,10 @@ class RobomimicFile:
             absent = sorted(set(self.masks[filter_key]) - set(self.demos))
             if absent:
                 raise ValueError(f"--filter_key={filter_key} names {absent}, which {self.path} does not hold")
+            if not self.masks[filter_key]:
+                raise ValueError(
+                    f"--filter_key={filter_key}: this mask of {self.path} selects no demonstration"
+                )
             return [demo for demo in self.demos if demo in set(self.masks[filter_key])]
         if episodes is None:
             return list(self.demos)
@@ -184,12 +184,12 @@ class RobomimicFile:
         """
         for demo in demos:
             group, length = self.data[demo], self.length(demo)
-            found = self.observation_shapes(demo)
+            observations = self.observation_shapes(demo)
             for key, shape in shapes.items():
                 if key not in group:
                     raise ValueError(
                         f"{self.path}: {demo} has no {key}; found {sorted(set(group) - {'obs', 'next_obs'})} and obs "
-                        f"{sorted(found)}"
+                        f"{list(observations)}"
                     )
                 if group[key].shape != (length, *shape):
                     raise ValueError(
@@ -212,7 +212,7 @@ class RobomimicFile:
         return length
 
     def read(self, demo: str, key: str) -> Array:
-        """One array of a demonstration, unchanged.
+        """Read one array of a demonstration, unchanged.
 
         Raises:
             ValueError: if it is damaged or holds numbers that float32 cannot.

@@ -1,6 +1,6 @@
-"""What robomimic's files hold and a LeRobotDataset does not, kept beside the dataset as `meta/robomimic.hdf5`.
+"""Recordings of a robomimic file in full precision, kept beside an imported dataset as `meta/robomimic.hdf5`.
 
-It has the file's own schema (see `robomimic_hdf5`) without observations: what robomimic calls a raw file, which its
+It has the file's own schema (see `robomimic_hdf5`) without observations: a raw file in robomimic's words, which its
 scripts can replay and extract observations from.
 """
 
@@ -25,21 +25,21 @@ class Recording:
     """One demonstration as it was recorded, without observations.
 
     `RobosuiteEnv.reset_to(states[0], model_xml)` puts the simulator where the actions began. Without the
-    model a replay of lift ends up millimetres off: robosuite draws the cube's size when it builds a model.
+    model a replay of lift ends up millimeters off: robosuite draws the cube's size when it builds a model.
 
     Attributes:
         demo: its name in the file.
         actions: (T, A) float64.
-        rewards: (T,) of the state that an action leads to.
-        dones: (T,).
+        rewards: (T,) of the state that an action leads to; None if the file has none.
+        dones: (T,); None if the file has none.
         states: (T, S) float64 flattened simulator states, before each action; None if the file has none.
         model_xml: the MuJoCo model; None if the file has none.
     """
 
     demo: str
     actions: Array
-    rewards: Array
-    dones: Array
+    rewards: Array | None
+    dones: Array | None
     states: Array | None
     model_xml: str | None
 
@@ -68,7 +68,7 @@ def copy_recordings(file: RobomimicFile, demos: Iterable[str], path: Path) -> No
 
 
 def load_recording(root: Path, demo: str) -> Recording:
-    """A demonstration as recorded, from the folder of an imported dataset; `meta/robomimic.json` has the names.
+    """Load a demonstration as recorded, from the folder of an imported dataset; `meta/robomimic.json` has the names.
 
     Raises:
         FileNotFoundError: if the dataset was not imported from robomimic.
@@ -81,8 +81,6 @@ def load_recording(root: Path, demo: str) -> Recording:
         return Recording(
             demo,
             actions=group["actions"][()],
-            rewards=group["rewards"][()],
-            dones=group["dones"][()],
-            states=group["states"][()] if "states" in group else None,
+            **{key: group[key][()] if key in group else None for key in ("rewards", "dones", "states")},
             model_xml=group.attrs.get("model_file"),
         )

@@ -1,25 +1,53 @@
-"""The tasks of robomimic (arXiv:2108.03298) that `--env.type=robomimic` knows, as a table without a simulator.
+"""The tasks of robomimic (arXiv:2108.03298) that `--env.type=robosuite_robomimic` has, as a table without a simulator.
 
-Whoever reads robomimic's HDF5 files finds here what LeRobot's raw keys are made of: `agent_pos` is the concatenation
-of `RobomimicTask.agent_keys` (HDF5: `obs/<key>`), `environment_state` that of `RobomimicTask.object_keys` (HDF5: one
-array, `obs/object`).
+`agent_pos` is the concatenation of `RobomimicTask.agent_keys` (HDF5: `obs/<key>`), `environment_state` that of
+`RobomimicTask.object_keys` (HDF5: one array, `obs/object`).
 
 Horizons and cameras are robomimic's (v0.5.0: `robomimic/__init__.py` and
 `robomimic/scripts/extract_obs_from_raw_datasets.sh`), object keys robosuite's own observables.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS
 
 FPS = 20
 """Control steps per second of simulated time (`control_freq`)."""
 
+ROBOT = "Panda"
+
+ARM_CONTROLLER: dict[str, Any] = {
+    "type": "OSC_POSE",
+    "input_max": 1,
+    "input_min": -1,
+    "output_max": [0.05, 0.05, 0.05, 0.5, 0.5, 0.5],  # meters, radians
+    "output_min": [-0.05, -0.05, -0.05, -0.5, -0.5, -0.5],
+    "kp": 150,
+    "damping_ratio": 1,
+    "impedance_mode": "fixed",
+    "kp_limits": [0, 300],
+    "damping_ratio_limits": [0, 10],
+    "position_limits": None,
+    "orientation_limits": None,
+    "uncouple_pos_ori": True,
+    "input_type": "delta",
+    "input_ref_frame": "world",
+    "interpolation": None,
+    "ramp_ratio": 0.2,
+    "gripper": {"type": "GRIP"},
+}
+"""robosuite 1.5's controller of every arm: that of robomimic's datasets (`env_args` of their files: composite `BASIC`).
+
+Values are those of robomimic's `docs/modules/environments.md` (v0.5.0), where `damping` and `control_delta` are
+1.4.1's names for `damping_ratio` and `input_type`.
+"""
+
 ARM_ACTION_DIM = 7
 """Per arm: displacement x, y, z (1 is 5 cm), rotation vector x, y, z (1 is 0.5 rad), gripper (-1 open, 1 closed)."""
 
 ARM_KEYS = ("eef_pos", "eef_quat", "gripper_qpos")
-"""What robomimic's low-dimensional policies see of an arm, in its order; `robot0_` or `robot1_` goes before it."""
+"""Observables of an arm for robomimic's low-dimensional policies, in its order, without the prefix `robot0_` or `robot1_`."""
 
 OBSERVED_KEYS: dict[str, tuple[str, ...]] = {
     "state": (AGENT_POS, ENVIRONMENT_STATE),
@@ -30,9 +58,9 @@ OBSERVED_KEYS: dict[str, tuple[str, ...]] = {
 
 
 def key_dim(key: str) -> int:
-    """Length of one observable of robosuite, told from its name.
+    """Length of one observable of robosuite, by its name.
 
-    Positions have 3 numbers (metres), quaternions 4 (x, y, z, w), the two fingers 2 (metres, of opposite sign), flags
+    Positions have 3 numbers (meters), quaternions 4 (x, y, z, w), the two fingers 2 (meters, of opposite sign), flags
     1; vectors from a gripper to an object, such as `gripper0_to_payload`, 3.
     """
     if key.endswith("_quat"):
@@ -46,7 +74,7 @@ def key_dim(key: str) -> int:
 
 @dataclass(frozen=True)
 class RobomimicTask:
-    """What this plugin must know of one task.
+    """Properties of one task.
 
     Attributes:
         robosuite_name: robosuite's name of the environment.

@@ -1,9 +1,7 @@
 """robomimic's tasks in robosuite 1.5, as gymnasium environments with LeRobot's raw keys.
 
-The controller is that of robomimic's datasets for robosuite 1.5 (`env_args` of their HDF5 files: composite `BASIC`,
-`OSC_POSE` with deltas in the world frame). Its values are those of robomimic's `docs/modules/environments.md`
-(v0.5.0), where `damping` and `control_delta` are 1.4.1's names for `damping_ratio` and `input_type`. The files say
-`lite_physics` false; true gives the same numbers, bit for bit, in less time.
+The settings are those of robomimic's datasets for robosuite 1.5, with one exception: the files say `lite_physics`
+false; true gives the same numbers, bit for bit, in less time.
 """
 
 import logging
@@ -16,43 +14,25 @@ import gymnasium as gym
 import numpy as np
 
 from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS, image_space, unbounded
-from lerobot_agpd.envs.robomimic_tasks import FPS, OBSERVED_KEYS, get_task
-from lerobot_agpd.envs.robosuite_cameras import SceneCameras
+from lerobot_agpd.envs.rendering import SceneRenderer
+from lerobot_agpd.envs.robomimic_tasks import ARM_CONTROLLER, FPS, OBSERVED_KEYS, ROBOT, get_task
 
 # robosuite warns at import of optional packages and of a settings file that hardly anybody has. Its logger sets its
-# own level while it is imported, so a filter it is.
+# own level during the import, which only a filter survives.
 logging.getLogger("robosuite_logs").addFilter(lambda record: record.levelno >= logging.ERROR)
 
 import robosuite  # noqa: E402
 
-ARM_CONTROLLER: dict[str, Any] = {
-    "type": "OSC_POSE",
-    "input_max": 1,
-    "input_min": -1,
-    "output_max": [0.05, 0.05, 0.05, 0.5, 0.5, 0.5],  # metres, radians
-    "output_min": [-0.05, -0.05, -0.05, -0.5, -0.5, -0.5],
-    "kp": 150,
-    "damping_ratio": 1,
-    "impedance_mode": "fixed",
-    "kp_limits": [0, 300],
-    "damping_ratio_limits": [0, 10],
-    "position_limits": None,
-    "orientation_limits": None,
-    "uncouple_pos_ori": True,
-    "input_type": "delta",
-    "input_ref_frame": "world",
-    "interpolation": None,
-    "ramp_ratio": 0.2,
-    "gripper": {"type": "GRIP"},
-}
+COLLISION_GROUP = 0
+"""robosuite's group of the geometry that collides; what is visible is in group 1."""
 
 MODEL_SEED = 0
-"""robosuite draws what a model is made of, such as the size of lift's cube, when it is built: always the same here."""
+"""Seed of the model: robosuite draws parts of it, such as the size of lift's cube, when it is built."""
 
 
 @dataclass(frozen=True)
 class View:
-    """What is observed, and what images look like; sizes are (height, width) in pixels."""
+    """Observed keys and cameras, and sizes of images, (height, width) in pixels."""
 
     obs_type: str = "state"
     cameras: tuple[str, ...] = ()
@@ -62,7 +42,7 @@ class View:
 
 @contextmanager
 def numpy_seeded(seed: int) -> Iterator[None]:
-    """Seed numpy's global generator, from which robosuite 1.5.1 draws, and put it back as it was."""
+    """Seed numpy's global generator, from which robosuite 1.5.1 draws, and restore it afterwards."""
     state = np.random.get_state()
     np.random.seed(seed)
     try:
@@ -100,7 +80,7 @@ class RobosuiteEnv(gym.Env):
         self.render_mode = render_mode
         with numpy_seeded(MODEL_SEED):
             self.simulation = self._build()
-        self.scene_cameras = SceneCameras()
+        self.scene_renderer = SceneRenderer(hidden_group=COLLISION_GROUP)
         self._has_foreign_model = False
         spaces: dict[str, gym.Space] = {
             AGENT_POS: unbounded(self.spec_of_task.agent_pos_dim),
@@ -112,13 +92,13 @@ class RobosuiteEnv(gym.Env):
         self.observation_space = gym.spaces.Dict({key: spaces[key] for key in self._keys})
         self.action_space = gym.spaces.Box(-1.0, 1.0, (self.spec_of_task.action_dim,), dtype=np.float32)
         self.state: dict[str, np.ndarray] = {}
-        """`agent_pos` and `environment_state` of the last observation, whatever `view` shows: for scripted experts."""
+        """`agent_pos` and `environment_state` of the last observation, also where `view` shows images: for experts."""
 
     def _build(self) -> Any:
         controller = {"type": "BASIC", "body_parts": {"right": ARM_CONTROLLER}}
         return robosuite.make(
             self.spec_of_task.robosuite_name,
-            robots=["Panda"] * self.spec_of_task.n_robots,
+            robots=[ROBOT] * self.spec_of_task.n_robots,
             controller_configs=[controller] * self.spec_of_task.n_robots,
             control_freq=FPS,
             reward_shaping=False,
@@ -149,10 +129,8 @@ class RobosuiteEnv(gym.Env):
         }
         observation: dict[str, Any] = {key: value for key, value in self.state.items() if key in self._keys}
         if PIXELS in self._keys:
-            observation[PIXELS] = {
-                camera: self.scene_cameras.render(self.simulation.sim, camera, self.view.observation_size)
-                for camera in self.view.cameras
-            }
+            size = self.view.observation_size
+            observation[PIXELS] = {camera: self._image(camera, size) for camera in self.view.cameras}
         return observation
 
     @property
@@ -174,8 +152,8 @@ class RobosuiteEnv(gym.Env):
     def _begin(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Make the episode a function of the current positions and velocities alone.
 
-        The contact solver forgets where it last ended, the controllers what they saw while they were built, the
-        sensors where objects were before.
+        Reset the warm start of the contact solver, the resting posture of the controllers and the last readings of
+        the sensors.
         """
         sim = self.simulation.sim
         sim.data.qacc_warmstart[:] = 0.0
@@ -218,7 +196,7 @@ class RobosuiteEnv(gym.Env):
             ValueError: if the state does not have the model's length.
         """
         if model_xml is not None:
-            self.scene_cameras.close()
+            self.scene_renderer.close()
             self._has_foreign_model = True
             self.simulation.reset_from_xml_string(self.simulation.edit_model_xml(model_xml))
         expected = self.get_state().shape
@@ -232,7 +210,7 @@ class RobosuiteEnv(gym.Env):
 
     def _restore_model(self) -> None:
         """Build the task's own model again, after one that `reset_to` loaded."""
-        self.scene_cameras.close()
+        self.scene_renderer.close()
         self.simulation.hard_reset = True
         with numpy_seeded(MODEL_SEED):
             self.simulation.reset()
@@ -241,10 +219,13 @@ class RobosuiteEnv(gym.Env):
 
     def render(self) -> np.ndarray:
         """Frame of `view.visualization_size` from the first of robomimic's cameras for the task."""
-        camera = self.spec_of_task.cameras[0]
-        return self.scene_cameras.render(self.simulation.sim, camera, self.view.visualization_size)
+        return self._image(self.spec_of_task.cameras[0], self.view.visualization_size)
+
+    def _image(self, camera: str, size: tuple[int, int]) -> np.ndarray:
+        sim = self.simulation.sim
+        return self.scene_renderer.render(sim.model._model, sim.data._data, camera, size)
 
     def close(self) -> None:
         """Free the graphics contexts and the simulation."""
-        self.scene_cameras.close()
+        self.scene_renderer.close()
         self.simulation.close()

@@ -1,7 +1,7 @@
-"""The tasks of Gymnasium-Robotics that `--env.type=gymnasium_robotics` knows, as a table.
+"""The tasks of Gymnasium-Robotics that `--env.type=gymnasium_robotics` has, as a table.
 
-Another task is one more entry in `TASKS`: which numbers of its observation belong to the robot, which to the scene,
-and what success means.
+A new task is one more entry in `TASKS` (which numbers of its observation belong to the robot and which to the scene,
+and what success means) and in `gymnasium_robotics.Task`.
 """
 
 from collections.abc import Callable
@@ -69,7 +69,7 @@ class ObservationLayout:
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """What this plugin must know of one task.
+    """Properties of one task.
 
     Attributes:
         description: one sentence, LeRobot's `task_description`.
@@ -163,25 +163,16 @@ TASKS: dict[str, TaskSpec] = {
 }
 
 KITCHEN = "FrankaKitchen-v1"
-KITCHEN_TASKS = (
-    "bottom burner",
-    "top burner",
-    "light switch",
-    "slide cabinet",
-    "hinge cabinet",
-    "microwave",
-    "kettle",
-)
 KITCHEN_DEFAULT = ("microwave", "kettle", "light switch", "slide cabinet")
 """The four of D4RL's `kitchen-complete` (arXiv:2004.07219)."""
 
 
-def get_task_spec(task: str | None) -> TaskSpec:
+def get_task(task: str | None) -> TaskSpec:
     """Look a task up in `TASKS`.
 
     Raises:
-        ValueError: if the task is not known.
+        ValueError: if the task is unknown.
     """
     if task not in TASKS:
-        raise ValueError(f"Unknown gymnasium_robotics task {task!r}. Known tasks: {', '.join(TASKS)}.")
+        raise ValueError(f"--env.task must be one of {', '.join(TASKS)}; got {task!r}.")
     return TASKS[task]

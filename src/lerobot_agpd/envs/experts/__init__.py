@@ -10,12 +10,15 @@ from lerobot_agpd.envs.experts.base import Expert
 EXPERTS: Mapping[str, Mapping[str, Expert]] = {
     "gymnasium_robotics": fetch.EXPERTS,
     "aloha_state": aloha.EXPERTS,
-    "robomimic": robomimic.EXPERTS,
+    "robosuite_robomimic": robomimic.EXPERTS,
 }
 """Environment type (`--env.type`) and task (`--env.task`) to expert."""
 
-IMPORT_COMMANDS = {"pusht": "lerobot-agpd-import-pusht", "robomimic": "lerobot-agpd-import-robomimic"}
-"""Environment type to the command that makes a dataset of people's demonstrations."""
+IMPORT_COMMANDS = {
+    "pusht": "lerobot-agpd-import-pusht",
+    "robosuite_robomimic": "lerobot-agpd-import-robomimic",
+}
+"""Environment type to the command that imports people's demonstrations."""
 
 
 def make_expert(env: EnvConfig) -> Expert:
@@ -23,10 +26,6 @@ def make_expert(env: EnvConfig) -> Expert:
 
     Args:
         env: an environment configuration of this package.
-
-    Returns:
-        A pure function from the raw observation of a single environment (`agent_pos`, `environment_state`) to an
-        action.
 
     Raises:
         ValueError: if the type or the task has no expert; it names the command that imports people's

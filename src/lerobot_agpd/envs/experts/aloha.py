@@ -1,7 +1,7 @@
 """A scripted expert for ALOHA's cube transfer: a pure function of one observation.
 
 The right hand picks the cube up and holds it out, the left hand takes it, the right one lets go and draws
-back. Nothing is remembered between steps: who does what follows from where hands, fingers and cube are. A cube
+back. The expert has no memory: its action follows from where hands, fingers and cube are. A cube
 that falls is picked up again. Fingers cross at the cube: the right hand points down at an angle and closes
 sideways, the left one lies flat and closes from above and below.
 
@@ -14,30 +14,29 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE
+from lerobot_agpd.envs.base import AGENT_POS
 from lerobot_agpd.envs.experts.aloha_kinematics import HandPoses, arm_kinematics, rotation_vectors
 from lerobot_agpd.envs.experts.aloha_servos import position_servos
-from lerobot_agpd.envs.experts.base import Array, Expert, Observation, ramp
+from lerobot_agpd.envs.experts.base import Array, Expert, Observation, ramp, state_vectors
 
-ARM_JOINTS = np.array(
-    [range(6), range(7, 13)]
-)  # (2, 6), places among the 14 numbers of `agent_pos` and of an action
+# Places among the 14 numbers of `agent_pos` and of an action.
+ARM_JOINTS = np.array([range(6), range(7, 13)])  # (2, 6)
 GRIPPERS = np.array([6, 13])  # (2,)
 
-# An intention of 1 moves the hand this far in one step of 20 ms along an axis, metres.
+# An intention of 1 moves the hand this far in one step of 20 ms along an axis, meters.
 STRIDE = 0.006
-# Share of a position error that a hand makes up in one step, when it is not limited by the stride.
+# Fraction of a position error that a hand corrects in one step, when it is not limited by the stride.
 POSITION_GAIN = 0.3
 # Fastest turn of a hand, radians per step.
 MAX_TURN = 0.06
 
 OPEN, CLOSE = 1.0, -1.0  # of an intention; an action has 1 and 0
 
-# Where the cube changes hands, and where the left hand waits for it, seen from there, metres. Low, so that a
+# Where the cube changes hands, and where the left hand waits for it, seen from there, meters. Low, so that a
 # cube that is lost on the way is soon picked up again.
 MEETING_POINT = np.array([0.0, 0.5, 0.15])
 LEFT_STANDOFF = np.array([-0.1, 0.0, 0.0])
-# Height of the right hand above the cube before it comes down, and its way back after the transfer, metres.
+# Height of the right hand above the cube before it comes down, and its way back after the transfer, meters.
 GRASP_CLEARANCE = 0.08
 RETREAT = 0.10
 
@@ -50,14 +49,14 @@ RIGHT_POINTS = RIGHT_ROTATION.as_matrix()[:, 0]
 
 @dataclass(frozen=True)
 class TransferScene:
-    """One observation of the transfer, by name. Positions (3,) in metres, world frame.
+    """One observation of the transfer, by name. Positions (3,) in meters, world frame.
 
     Attributes:
         left: position of the left hand.
         right: position of the right hand.
         left_opening: of the left gripper, 0 closed, 1 open, 0.61 around the cube.
         right_opening: of the right gripper.
-        cube: position of the cube's centre.
+        cube: position of the cube's center.
         cube_heading: angle about the vertical of the cube's sides, radians, in [-pi/4, pi/4].
     """
 
@@ -75,11 +74,9 @@ class TransferScene:
         Raises:
             ValueError: if the shapes differ, for instance because the observation is batched.
         """
+        agent, pose = state_vectors(observation, 14, 7)
         left, right = hand_positions(observation)
-        openings = np.asarray(observation[AGENT_POS], dtype=np.float64)[GRIPPERS]
-        pose = np.asarray(observation[ENVIRONMENT_STATE], dtype=np.float64)
-        if pose.shape != (7,):
-            raise ValueError(f"Expected {ENVIRONMENT_STATE} (7,) of a single environment, got {pose.shape}.")
+        openings = agent[GRIPPERS]
         return cls(left, right, float(openings[0]), float(openings[1]), pose[:3], heading_of_sides(pose[3:]))
 
     @property
@@ -117,7 +114,7 @@ def heading_of_sides(quaternion: Array) -> float:
 
 
 def hand_rotations(scene: TransferScene) -> Array:
-    """How the hands (2, 3, 3) shall be turned.
+    """Orientations (2, 3, 3) that the hands shall have.
 
     The left one is always turned alike. The right one follows the sides of the cube until it has it, and then
     faces the left one: from aside its fingers would be in the left one's way.
@@ -126,31 +123,19 @@ def hand_rotations(scene: TransferScene) -> Array:
     return np.stack([LEFT_ROTATION.as_matrix(), right.as_matrix()])
 
 
-def _arm_joints(observation: Observation) -> Array:
-    """Joint positions (2, 6), radians, left arm first."""
-    agent = np.asarray(observation[AGENT_POS], dtype=np.float64)
-    if agent.shape != (14,):
-        raise ValueError(f"Expected {AGENT_POS} (14,) of a single environment, got {agent.shape}.")
-    return agent[ARM_JOINTS]
-
-
 def hand_positions(observation: Observation) -> Array:
-    """Positions (2, 3) of the hands, metres, left first.
-
-    Raises:
-        ValueError: if `agent_pos` is not (14,).
-    """
-    return arm_kinematics().forward(_arm_joints(observation)).positions
+    """Positions (2, 3) of the hands, meters, left first."""
+    return arm_kinematics().forward(observation[AGENT_POS][ARM_JOINTS]).positions
 
 
 def _intention(displacement: Array, closing: float) -> Array:
-    """Intention (4,) for a displacement (3,) in metres, its direction kept, and fingers closing in [0, 1]."""
+    """Intention (4,) for a displacement (3,) in meters, its direction kept, and fingers closing in [0, 1]."""
     motion = POSITION_GAIN * displacement / STRIDE
     return np.append(motion / max(1.0, float(np.abs(motion).max())), OPEN + (CLOSE - OPEN) * closing)
 
 
 def intend_transfer(observation: Observation) -> Array:
-    """What the two hands shall do, stages blending into each other.
+    """Intentions of the two hands, stages blending into each other.
 
     Args:
         observation: `agent_pos` (14,), `environment_state` (7,).
@@ -189,7 +174,7 @@ def _left_displacement(scene: TransferScene) -> Array:
 
 
 def joint_targets(observation: Observation, intention: Array) -> np.ndarray:
-    """Carry out what the hands shall do, turning them toward `hand_rotations` on the way.
+    """Turn the intentions of the hands into joint targets, and the hands toward `hand_rotations`.
 
     Args:
         observation: `agent_pos` (14,), `environment_state` (7,).
@@ -200,7 +185,7 @@ def joint_targets(observation: Observation, intention: Array) -> np.ndarray:
     """
     arms = arm_kinematics()
     scene = TransferScene.from_observation(observation)
-    joints = _arm_joints(observation)
+    joints = np.asarray(observation[AGENT_POS], dtype=np.float64)[ARM_JOINTS]
     now = arms.forward(joints)
     turn = rotation_vectors(now, HandPoses(now.positions, hand_rotations(scene)))  # (2, 3)
     angle = np.linalg.norm(turn, axis=1, keepdims=True)

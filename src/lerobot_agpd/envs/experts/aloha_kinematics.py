@@ -18,11 +18,11 @@ ARM_DOF = 6
 MODEL_JOINTS = np.array([range(6), range(8, 14)])
 """Places (2, 6) of the arms' joints in MuJoCo's model, where every gripper has two fingers."""
 
-# The hand is a point between the fingers, this far ahead of the gripper's origin, metres. They end at 0.154.
+# The hand is a point between the fingers, this far ahead of the gripper's origin, meters. They end at 0.154.
 HAND_OFFSET = 0.14
 
-DAMPING = 0.01  # metres
-METRES_PER_RADIAN = 0.1  # what an orientation error weighs against a position error
+DAMPING = 0.01  # meters
+METERS_PER_RADIAN = 0.1  # what an orientation error weighs against a position error
 ITERATIONS = 2
 
 
@@ -31,7 +31,7 @@ class HandPoses:
     """Where both hands are, left first, in the world frame.
 
     Attributes:
-        positions: (2, 3), metres.
+        positions: (2, 3), meters.
         rotations: (2, 3, 3); columns are where the fingers point, the axis along which they close, and their
             cross product.
     """
@@ -93,7 +93,7 @@ class ArmKinematics:
         for _ in range(ITERATIONS):
             poses = self.forward(solution)
             error = np.concatenate(
-                [goal.positions - poses.positions, METRES_PER_RADIAN * rotation_vectors(poses, goal)], axis=1
+                [goal.positions - poses.positions, METERS_PER_RADIAN * rotation_vectors(poses, goal)], axis=1
             )
             jacobians = self._jacobians_here(poses)  # (2, 6, 6)
             transposed = jacobians.transpose(0, 2, 1)
@@ -118,7 +118,7 @@ class ArmKinematics:
         for arm, (body, position) in enumerate(zip(self._hands, poses.positions, strict=True)):
             self._mujoco.mj_jac(self.model, self._data, of_all_joints[:3], of_all_joints[3:], position, body)
             jacobians[arm] = of_all_joints[:, MODEL_JOINTS[arm]]
-        jacobians[:, 3:] *= METRES_PER_RADIAN
+        jacobians[:, 3:] *= METERS_PER_RADIAN
         return jacobians
 
 

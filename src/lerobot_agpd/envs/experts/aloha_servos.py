@@ -1,4 +1,4 @@
-"""What to ask of ALOHA's simulated position servos so that a joint moves a wanted distance in one step.
+"""Targets for ALOHA's simulated position servos that move a joint a given distance in one step.
 
 The servos are springs, torque = kp * (target - position), that pull against strong dry friction (gym_aloha's
 `frictionloss`). A target one step ahead hardly moves the arm. MuJoCo softens friction: below its limit a
@@ -29,8 +29,8 @@ class PositionServos:
     """The arms' servos.
 
     Attributes:
-        stiffness: (2, 6) kp, newton metres per radian.
-        creep_rate: (2, 6) share of the distance to the target that a creeping joint covers in one step.
+        stiffness: (2, 6) kp, newton meters per radian.
+        creep_rate: (2, 6) fraction of the distance to the target that a creeping joint covers in one step.
         friction_limit: (2, 6) distance to the target at which a joint breaks loose, radians.
     """
 
@@ -43,7 +43,7 @@ class PositionServos:
 
         Args:
             joints: (2, 6) positions, radians.
-            step: (2, 6) wanted motion, radians.
+            step: (2, 6) motion, radians.
 
         Returns:
             (2, 6), radians, within the actuators' range.

@@ -1,4 +1,4 @@
-"""What a scripted expert is: intentions of hands, and a body that turns them into actions."""
+"""Base of the scripted experts: intentions of hands, and a body that turns them into actions."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_agpd.envs.base import AGENT_POS
+from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE
 
 Array = NDArray[np.float64]
 Observation = dict[str, np.ndarray]
@@ -15,6 +15,22 @@ Observation = dict[str, np.ndarray]
 def ramp(value: float, zero_at: float, one_at: float) -> float:
     """Rise linearly from 0 at `zero_at` to 1 at `one_at` (or fall, if `one_at` is the smaller), clipped."""
     return float(np.clip((value - zero_at) / (one_at - zero_at), 0.0, 1.0))
+
+
+def state_vectors(
+    observation: Observation, agent_pos_dim: int, environment_state_dim: int
+) -> tuple[Array, Array]:
+    """Return `agent_pos` (agent_pos_dim,) and `environment_state` (environment_state_dim,) in float64.
+
+    Raises:
+        ValueError: if the shapes differ, for instance because the observation is batched.
+    """
+    vectors = []
+    for key, dim in ((AGENT_POS, agent_pos_dim), (ENVIRONMENT_STATE, environment_state_dim)):
+        vectors.append(np.asarray(observation[key], dtype=np.float64))
+        if vectors[-1].shape != (dim,):
+            raise ValueError(f"Expected {key} ({dim},) of a single environment, got {vectors[-1].shape}.")
+    return vectors[0], vectors[1]
 
 
 def _only_hand(observation: Observation) -> Array:
@@ -29,13 +45,13 @@ def _as_action(observation: Observation, intention: Array) -> np.ndarray:
 class Expert:
     """A scripted expert: a pure function from one raw observation of a single environment to an action.
 
-    It is told in two parts, so that operators of limited skill (`envs.operators`) can disturb what the hands do
-    whatever the robot. The defaults fit a robot with one hand whose action is the intention itself.
+    It has two parts, so that operators of limited skill (`envs.operators`) can disturb the hands of any robot. The
+    defaults fit a robot with one hand whose action is the intention itself.
 
     Attributes:
-        intend: observation to what every hand shall do, (H, 4) or (4,) for one hand: a displacement x, y, z in
+        intend: observation to the intention of every hand, (H, 4) or (4,) for one hand: a displacement x, y, z in
             [-1, 1], 1 being the fastest motion of the hand, and the gripper.
-        hands: observation to the positions (H, 3) of the hands, metres.
+        hands: observation to the positions (H, 3) of the hands, meters.
         act: observation and intention (H, 4) to the environment's action (A,), float32.
     """
 
@@ -44,7 +60,7 @@ class Expert:
     act: Callable[[Observation, Array], np.ndarray] = _as_action
 
     def intentions(self, observation: Observation) -> Array:
-        """What every hand shall do, (H, 4)."""
+        """Intention of every hand, (H, 4)."""
         return np.atleast_2d(np.asarray(self.intend(observation), dtype=np.float64))
 
     def __call__(self, observation: Observation) -> np.ndarray:

@@ -1,41 +1,40 @@
 """Scripted experts for the Fetch tasks: pure functions of one observation.
 
-Nothing is remembered between steps. What to do next follows from the geometry of the moment, so a policy cloned from
-the demonstrations sees everything that its expert saw. Stages blend into each other over a few millimetres or
-centimetres instead of switching, so that actions change smoothly.
+An expert has no memory: its action follows from the current geometry, so a policy cloned from the demonstrations
+observes everything that its expert observed. Stages blend into each other over a few millimeters or centimeters
+instead of switching, so that actions change smoothly.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE
-from lerobot_agpd.envs.experts.base import Array, Expert, ramp
+from lerobot_agpd.envs.experts.base import Array, Expert, ramp, state_vectors
 
-# Action units per metre of position error. An action of 1 asks for 5 cm in one step; the arm follows with a lag.
+# Action units per meter of position error. An action of 1 asks for 5 cm in one step; the arm follows with a lag.
 POSITION_GAIN = 10.0
 
 OPEN, CLOSE = 1.0, -1.0
 
-# Height of the hand above the block's centre before it comes down to grasp or to push, metres.
+# Height of the hand above the block's center before it comes down to grasp or to push, meters.
 GRASP_CLEARANCE = 0.10
 PUSH_CLEARANCE = 0.08
-# Distance from the block's centre at which the hand comes down, and at which it touches, metres.
+# Distance from the block's center at which the hand comes down, and at which it touches, meters.
 PUSH_STANDOFF = 0.065
 PUSH_CONTACT = 0.04
-# How far ahead of itself a pushing hand aims at most, metres: this bounds the speed of the block.
+# How far ahead of itself a pushing hand aims at most, meters: this bounds the speed of the block.
 PUSH_STRIDE = 0.06
 
 
 @dataclass(frozen=True)
 class FetchScene:
-    """One observation of a Fetch task with an object, by name. Positions (3,) in metres, world frame.
+    """One observation of a Fetch task with an object, by name. Positions (3,) in meters, world frame.
 
     Attributes:
         grip: position between the fingertips.
         width: distance between the fingers, 0 closed, about 0.1 open, 0.05 around the block.
-        block: position of the block's centre.
-        goal: where the block shall be.
+        block: position of the block's center.
+        goal: position where the block shall be.
     """
 
     grip: Array
@@ -50,24 +49,12 @@ class FetchScene:
         Raises:
             ValueError: if the shapes differ, for instance because the observation is batched.
         """
-        agent, scene = _state_vectors(observation, 18)
+        agent, scene = state_vectors(observation, 10, 18)
         return cls(grip=agent[:3], width=float(agent[3] + agent[4]), block=scene[:3], goal=scene[-3:])
 
 
-def _state_vectors(observation: dict[str, np.ndarray], environment_dim: int) -> tuple[Array, Array]:
-    """Return `agent_pos` (10,) and `environment_state` (environment_dim,) in float64, their shapes checked."""
-    agent = np.asarray(observation[AGENT_POS], dtype=np.float64)
-    scene = np.asarray(observation[ENVIRONMENT_STATE], dtype=np.float64)
-    if agent.shape != (10,) or scene.shape != (environment_dim,):
-        raise ValueError(
-            f"Expected {AGENT_POS} (10,) and {ENVIRONMENT_STATE} ({environment_dim},) of a single environment, "
-            f"got {agent.shape} and {scene.shape}."
-        )
-    return agent, scene
-
-
 def _action(displacement: Array, gripper: float) -> np.ndarray:
-    """Proportional action (4,) in [-1, 1], float32, for a wanted displacement (3,) in metres."""
+    """Proportional action (4,) in [-1, 1], float32, for a displacement (3,) in meters."""
     return np.clip(np.append(POSITION_GAIN * displacement, gripper), -1.0, 1.0).astype(np.float32)
 
 
@@ -80,7 +67,7 @@ def fetch_reach_expert(observation: dict[str, np.ndarray]) -> np.ndarray:
     Returns:
         Action (4,) in [-1, 1], float32.
     """
-    agent, goal = _state_vectors(observation, 3)
+    agent, goal = state_vectors(observation, 10, 3)
     return _action(goal - agent[:3], gripper=0.0)
 
 

@@ -1,6 +1,6 @@
 """Scripted experts for robomimic's lift and can: pure functions of one observation.
 
-As in `experts.fetch`, nothing is remembered between steps and stages blend into each other. The intention of the hand
+As in `experts.fetch`, experts have no memory and stages blend into each other. The intention of the hand
 is a displacement and the gripper; `act` adds the rotation that keeps the hand pointing down, its fingers aligned with
 the cube or with the bins.
 """
@@ -11,40 +11,39 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE
-from lerobot_agpd.envs.experts.base import Array, Expert, Observation, ramp
+from lerobot_agpd.envs.experts.base import Array, Expert, Observation, ramp, state_vectors
 from lerobot_agpd.envs.robomimic_tasks import TASKS
 
-# Action units per metre of position error. An action of 1 asks for 5 cm in one step, of which the arm does 1.1.
+# Action units per meter of position error. An action of 1 asks for 5 cm in one step, of which the arm does 1.1.
 POSITION_GAIN = 20.0
 # Action units per radian. An action of 1 asks for 0.5 rad in one step.
 ROTATION_GAIN = 2.0
 
 OPEN, CLOSE = -1.0, 1.0
 
-# Height of the hand above the object's centre before it comes down to grasp, metres.
+# Height of the hand above the object's center before it comes down to grasp, meters.
 GRASP_CLEARANCE = 0.09
 # Where the cube is taken to: 8 cm above its place on the table; the episode ends half-way.
 CUBE_HEIGHT = 0.90
 
-# The can's compartment, a quarter of the second bin: centre x, y of robosuite's `target_bin_placements`, metres.
+# The can's compartment, a quarter of the second bin: center x, y of robosuite's `target_bin_placements`, meters.
 CAN_GOAL = np.array([0.1975, 0.4025])
-# Height of the can's centre above the bins' walls and on the bins' floor.
+# Height of the can's center above the bins' walls and on the bins' floor.
 CAN_CARRY_HEIGHT = 1.02
 CAN_REST_HEIGHT = 0.86
-# Height of the hand above the can's centre when it grasps.
+# Height of the hand above the can's center when it grasps.
 CAN_GRIP_HEIGHT = 0.02
 
 
 @dataclass(frozen=True)
 class PandaScene:
-    """One observation of a task with one object, by name. Positions (3,) in metres, world frame, z up.
+    """One observation of a task with one object, by name. Positions (3,) in meters, world frame, z up.
 
     Attributes:
         grip: position between the fingertips.
         hand: orientation of the hand, whose z axis points out between the fingers.
         width: distance between the fingers, 0 closed, 0.08 open.
-        thing: position of the object's centre.
+        thing: position of the object's center.
         thing_rotation: its orientation.
     """
 
@@ -62,13 +61,7 @@ class PandaScene:
             ValueError: if the shapes differ, for instance because the observation is batched.
         """
         spec = TASKS[task]
-        agent = np.asarray(observation[AGENT_POS], dtype=np.float64)
-        scene = np.asarray(observation[ENVIRONMENT_STATE], dtype=np.float64)
-        if agent.shape != (spec.agent_pos_dim,) or scene.shape != (spec.environment_state_dim,):
-            raise ValueError(
-                f"Expected {AGENT_POS} ({spec.agent_pos_dim},) and {ENVIRONMENT_STATE} "
-                f"({spec.environment_state_dim},) of a single environment, got {agent.shape} and {scene.shape}."
-            )
+        agent, scene = state_vectors(observation, spec.agent_pos_dim, spec.environment_state_dim)
         pose = scene[:7] if task == "lift" else scene[7:14]  # can: the relative pose is first, and late
         return cls(
             grip=agent[:3],
@@ -95,7 +88,7 @@ class PandaScene:
 
 
 def _intention(displacement: Array, gripper: float) -> Array:
-    """Proportional intention (4,) in [-1, 1] for a wanted displacement (3,) in metres."""
+    """Proportional intention (4,) in [-1, 1] for a displacement (3,) in meters."""
     return np.clip(np.append(POSITION_GAIN * displacement, gripper), -1.0, 1.0)
 
 
