@@ -14,12 +14,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_agpd.analysis.diversity import (
+from lerobot_agpd.studies.diversity import (
     Gaussian,
     gaussian_kl,
     knn_entropy,
     match_moments,
-    standardise,
+    standardize,
     state_coverage,
 )
 from lerobot_agpd.collect.config import DiagnosticsConfig
@@ -149,7 +149,7 @@ def state_path(episode: Episode, stats: Statistics) -> Array:
     vectors = {key: value for key, value in episode.observations.items() if value.ndim == 2 and key in stats}
     floored = floor_statistics({key: stats[key] for key in vectors})
     columns = [
-        standardise(vectors[key], floored[key]["mean"], floored[key]["std"]) for key in sorted(vectors)
+        standardize(vectors[key], floored[key]["mean"], floored[key]["std"]) for key in sorted(vectors)
     ]
     return np.concatenate(columns, axis=1) if columns else np.empty((len(episode), 0))
 

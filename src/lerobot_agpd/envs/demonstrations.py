@@ -10,7 +10,7 @@ from lerobot.utils.constants import ACTION, DONE, REWARD, SUCCESS
 from lerobot.utils.utils import flatten_dict
 from rich.table import Table
 
-from lerobot_agpd.analysis.statistics import Estimate, success_rate
+from lerobot_agpd.studies.statistics import Estimate, success_rate
 from lerobot_agpd.envs.experts.base import Observation
 
 Frame = dict[str, Any]
