@@ -11,18 +11,23 @@ import re
 import sys
 from pathlib import Path
 
+import committed
 import numpy as np
 
-from lerobot_agpd.analysis.frontier import NAMES
-from lerobot_agpd.analysis.report import MethodResult, markdown
-from lerobot_agpd.analysis.statistics import success_rate
-from lerobot_agpd.comparison.matrix import Matrix, load_matrix
-from lerobot_agpd.comparison.pictures import write_pictures
-from lerobot_agpd.comparison.results import RunResult, read_results
-from lerobot_agpd.comparison.table import difference_cell, raised, report
+from lerobot_agpd.studies.comparison import write_pictures
+from lerobot_agpd.studies.frontier import NAMES
+from lerobot_agpd.studies.matrix import Matrix, load_matrix
+from lerobot_agpd.studies.report import comparison_report
+from lerobot_agpd.studies.results import RunResult
+from lerobot_agpd.studies.run_results import read_results
+from lerobot_agpd.studies.statistics import success_rate
+from lerobot_agpd.studies.tables import difference_cell, markdown, raised, rounds_table, summary_table
 
 ROOT = Path(__file__).parent.parent
-COMPARISON = ROOT / "benchmarks" / "comparison"
+BENCHMARKS = ROOT / "benchmarks"
+COMPARISON = BENCHMARKS / "comparison"
+PAGES = ROOT / "docs" / "results"
+README = ROOT / "README.md"
 SUMMARY = {
     "bc": "cloning",
     "pd": "PD",
@@ -32,53 +37,27 @@ SUMMARY = {
     "agpd_long": "AGPD, 3x steps",
     "teacher": "teacher",
 }
-"""Methods of the README's table, and what it calls them."""
+"""Methods of the README's table, and their names there."""
 
 Results = dict[str, dict[str, list[RunResult]]]
 """Task and method to results, one per training seed."""
 
-COLUMNS = ("round", "scale", "guided", "unguided", "generated", "kept", "shift in sigmas", "seconds")
+ROUNDS = "Successful / counted episodes; episodes that are solved at the start count nowhere."
 
 
-def results(folder: Path) -> list[MethodResult]:
-    return [
-        MethodResult.from_json(entry) for entry in json.loads((folder / "report.json").read_text())["methods"]
-    ]
+def text(folder: Path) -> str:
+    return (folder / "README.md").read_text().rstrip()
 
 
-def share(counts: dict) -> str:
-    counted = counts["generated"] - counts["trivial"]
-    return f"{counts['successful']} / {counted}" if counted else "-"
-
-
-def rounds_table(rounds: list[dict]) -> str:
-    rows = [
-        (
-            str(entry["round"]),
-            f"{entry['scale']:.3g}",
-            share(entry["guided"]),
-            share(entry["unguided"]),
-            str(entry["generated"]),
-            str(entry["kept"]),
-            "-" if entry["mean_shift_in_sigmas"] is None else f"{entry['mean_shift_in_sigmas']:.2f}",
-            f"{sum(entry['seconds'].values()):.0f}",
-        )
-        for entry in rounds
-    ]
-    lines = [COLUMNS, tuple("---" for _ in COLUMNS), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
-
-
-def page(folder: Path) -> str:
-    parts = [(folder / "README.md").read_text().rstrip(), markdown(results(folder)).rstrip()]
+def report_page(folder: Path) -> str:
+    results = committed.read_report(folder / "report.json")
+    parts = [text(folder), markdown(summary_table(results))]
     if (folder / "curves.png").exists():
         parts.append(f"![learning curves](../../benchmarks/{folder.name}/curves.png)")
-    for result in results(folder):
-        if result.collection:
-            parts.append(
-                f"## Collection rounds of {result.name}\n\nPassed / counted episodes; trivial starts count nowhere.\n\n"
-                + rounds_table(result.collection["rounds"]).rstrip()
-            )
+    for result in results:
+        if result.rounds:
+            title = f"## Collection rounds of {result.name}"
+            parts += [title, ROUNDS, markdown(rounds_table(result.rounds))]
     return "\n\n".join(parts) + "\n"
 
 
@@ -86,30 +65,26 @@ def latency_page(path: Path) -> str:
     """Milliseconds per chunk: median [95th percentile], one column per batch size."""
     content = json.loads(path.read_text())
     sizes = sorted({entry["batch_size"] for entry in content["entries"]})
-    header = ("", "parameters", "denoising steps", *(f"batch {size}" for size in sizes))
-    rows: dict[tuple[str, str], dict[int, dict]] = {}
+    rows = [("", "parameters", "denoising steps", *(f"batch {size}" for size in sizes))]
+    entries: dict[tuple[str, str], dict[int, dict]] = {}
     for entry in content["entries"]:
-        rows.setdefault((entry["name"], entry["sampler"]), {})[entry["batch_size"]] = entry
-    lines = [header, tuple("---" for _ in header)]
-    for (name, sampler), cells in rows.items():
+        entries.setdefault((entry["name"], entry["sampler"]), {})[entry["batch_size"]] = entry
+    for (name, sampler), cells in entries.items():
         size = f"{cells[sizes[0]]['n_parameters'] / 1e6:.2f} M"
         times = [f"{cells[n]['median_ms']:.1f} [{cells[n]['p95_ms']:.1f}]" for n in sizes]
-        lines.append((name, size, sampler, *times))
+        rows.append((name, size, sampler, *times))
     where = f"{content['device']}, {content['threads']} thread(s), torch {content['torch']}."
-    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-    return f"{(path.parent / 'README.md').read_text().rstrip()}\n\n{where}\n\n{table}\n"
+    return f"{text(path.parent)}\n\n{where}\n\n{markdown(rows)}\n"
 
 
 def diversity_page(folder: Path) -> str:
     """A sweep of `lerobot-agpd-diversity`: its text, numbers and pictures."""
-    content = json.loads((folder / "sweep.json").read_text())
     columns = ("strategy", "strength", "success", "rms to teacher", "rms to student", "KL to teacher, median")
-    header = (*columns, "entropy of visited states", "student's states covered")
-    lines = [header, tuple("---" for _ in header)]
-    for row in content["rows"]:
+    rows = [(*columns, "entropy of visited states", "student's states covered")]
+    for row in committed.read_sweep(folder / "sweep.json"):
         actions = row["actions"]
         numbers = [actions[key] for key in ("rms_to_teacher", "rms_to_student", "kl_to_teacher_median")]
-        lines.append(
+        rows.append(
             (
                 NAMES[row["setting"]["strategy"]],
                 f"{row['setting']['strength']:g}",
@@ -119,12 +94,11 @@ def diversity_page(folder: Path) -> str:
                 f"{row['coverage']:.3f}",
             )
         )
-    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
     pictures = [
         f"![{name}](../../benchmarks/diversity/{folder.name}/{name}.png)"
         for name in ("frontier", "trajectories")
     ]
-    return "\n\n".join([(folder / "README.md").read_text().rstrip(), table, *pictures]) + "\n"
+    return "\n\n".join([text(folder), markdown(rows), *pictures]) + "\n"
 
 
 def environments_page(folder: Path) -> str:
@@ -133,25 +107,16 @@ def environments_page(folder: Path) -> str:
     for row in json.loads((folder / "experts.json").read_text()):
         played.setdefault((row["task"], row["episode_length"]), {})[row["skill"]] = row
     skills = sorted({skill for cells in played.values() for skill in cells}, reverse=True)
-    header = ("", "episode limit", *(f"skill {skill:g}" for skill in skills))
-    lines = [header, tuple("---" for _ in header)]
+    experts = [("", "episode limit", *(f"skill {skill:g}" for skill in skills))]
     for (task, episode_length), cells in played.items():
-        lines.append((task, str(episode_length), *(operator_cell(cells[skill]) for skill in skills)))
+        experts.append((task, str(episode_length), *(operator_cell(cells[skill]) for skill in skills)))
     speed = json.loads((folder / "speed.json").read_text())
-    rows = [("", "steps per second", "least", "most"), ("---",) * 4]
+    speeds = [("", "steps per second", "least", "most")]
     for name, row in speed["rows"].items():
-        rows.append(
-            (
-                name,
-                *(
-                    f"{row[key]:.{0 if row[key] > 100 else 1}f}"
-                    for key in ("steps_per_second", "least", "most")
-                ),
-            )
-        )
-    experts, speeds = ("\n".join("| " + " | ".join(line) + " |" for line in table) for table in (lines, rows))
-    text = (folder / "README.md").read_text().rstrip()
-    return text.format(experts=experts, speeds=speeds, ratio=f"{speed['aloha_ratio']:.1f}") + "\n"
+        values = (row[key] for key in ("steps_per_second", "least", "most"))
+        speeds.append((name, *(f"{value:.{0 if value > 100 else 1}f}" for value in values)))
+    tables = {"experts": markdown(experts), "speeds": markdown(speeds)}
+    return text(folder).format(**tables, ratio=f"{speed['aloha_ratio']:.1f}") + "\n"
 
 
 def operator_cell(row: dict) -> str:
@@ -161,81 +126,78 @@ def operator_cell(row: dict) -> str:
     return f"{success_rate(row['successes'])}, N = {len(row['successes'])}; {median}"
 
 
-def committed(path: Path) -> tuple[Matrix, Results, list[str]] | None:
+def read_comparison(path: Path) -> tuple[Matrix, Results, list[str]] | None:
     """A matrix, its committed results and the names of missing runs; None if nothing of it is committed."""
-    results_folder = COMPARISON / "results" / path.stem
-    files = sorted(results_folder.glob("*/*/seed-*/run.json"))
+    folder = COMPARISON / "results" / path.stem
+    files = sorted(folder.glob("*/*/seed-*/run.json"))
     if not files:
         return None
     root = json.loads(files[0].read_text())["flags"]["dataset.root"]
     os.environ["AGPD_RUNS"] = root.rpartition("/data/")[0]  # where the runs were made: part of their flags
     matrix = load_matrix(path)
-    matrix.output = results_folder
-    return matrix, *read_results(matrix)
+    matrix.output = folder
+    return matrix, *read_results(matrix, committed.read_run)
 
 
-def comparison_page(path: Path, matrix: Matrix, found: Results, missing: list[str], draw: bool) -> str:
-    """The page of one matrix; its pictures are drawn beside the results."""
-    if draw:
-        write_pictures(matrix, found, matrix.output)
-    text = (COMPARISON / f"{path.stem}.md").read_text().rstrip()
-    return f"{text}\n\n{report(matrix, found, missing, f'../../{matrix.output.relative_to(ROOT)}/')}"
+def comparison_page(path: Path, matrix: Matrix, results: Results, missing: list[str]) -> str:
+    notes = (COMPARISON / f"{path.stem}.md").read_text().rstrip()
+    pictures = f"../../{matrix.output.relative_to(ROOT)}/"
+    return f"{notes}\n\n{comparison_report(matrix, results, missing, pictures)}"
 
 
 def summary(comparisons: dict[Path, tuple[Matrix, Results, list[str]]]) -> str:
     """One row per task and one column per method: the task's measure at the last checkpoint."""
-    header = ("", *SUMMARY.values(), "AGPD minus PD")
-    lines = [header, tuple("---" for _ in header)]
-    for path, (matrix, found, _) in comparisons.items():
-        for task, methods in found.items():
+    rows = [("", *SUMMARY.values(), "AGPD minus PD")]
+    for path, (matrix, results, _) in comparisons.items():
+        for task, methods in results.items():
             entry = matrix.tasks[task]
-            cells = [summary_cell(methods.get(name, []), entry.measure) for name in SUMMARY]
             measure = "" if entry.measure == "success" else ", mean max reward"
-            lines.append(
-                (
-                    f"[{entry.title or task}](docs/results/comparison-{path.stem}.md){measure}",
-                    *cells,
-                    difference_cell(methods.get("agpd", []), methods.get("pd", []), "last", entry.measure),
-                )
-            )
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+            link = f"[{entry.title or task}](docs/results/comparison-{path.stem}.md){measure}"
+            cells = [summary_cell(methods.get(name, []), entry.measure) for name in SUMMARY]
+            pair = (methods.get("agpd", []), methods.get("pd", []))
+            rows.append((link, *cells, difference_cell(*pair, "last", entry.measure)))
+    return markdown(rows)
 
 
 def summary_cell(runs: list[RunResult], measure: str) -> str:
     """The mean over all training seeds; how many there are, as a raised number."""
     if not runs:
         return ""
-    value = f"{np.mean([run.values('last', measure) for run in runs]):.2f}"
+    value = f"{np.mean([run.finals['last'].values(measure) for run in runs]):.2f}"
     return value if runs[0].steps is None else value + raised(len(runs))
 
 
-def filled(text: str, name: str, table: str) -> str:
+def filled(page: str, name: str, table: str) -> str:
     """A text whose table between `<!-- name-results -->` and `<!-- end -->` is exchanged."""
     pattern = re.compile(rf"(<!-- {name}-results -->\n).*?(<!-- end -->)", re.DOTALL)
-    return pattern.sub(lambda match: f"{match[1]}{table}\n{match[2]}", text)
+    return pattern.sub(lambda match: f"{match[1]}{table}\n{match[2]}", page)
+
+
+def render(draw: bool) -> dict[Path, str]:
+    """All pages; the pictures of comparisons are drawn beside their results."""
+    pages = {README: README.read_text()}
+    for folder in sorted(path.parent for path in BENCHMARKS.glob("*/report.json")):
+        pages[PAGES / f"{folder.name}.md"] = report_page(folder)
+        table = markdown(summary_table(committed.read_report(folder / "report.json")))
+        pages[README] = filled(pages[README], folder.name, table)
+    for path in sorted((BENCHMARKS / "latency").glob("latency-*.json")):
+        pages[PAGES / f"{path.stem}.md"] = latency_page(path)
+    for folder in sorted(path.parent for path in (BENCHMARKS / "diversity").glob("*/sweep.json")):
+        pages[PAGES / f"diversity-{folder.name}.md"] = diversity_page(folder)
+    pages[PAGES / "environments.md"] = environments_page(BENCHMARKS / "environments")
+    found = {path: read_comparison(path) for path in sorted(COMPARISON.glob("*.yaml"))}
+    comparisons = {path: entry for path, entry in found.items() if entry is not None}
+    for path, (matrix, results, missing) in comparisons.items():
+        if draw:
+            write_pictures(matrix, results, matrix.output)
+        pages[PAGES / f"comparison-{path.stem}.md"] = comparison_page(path, matrix, results, missing)
+    pages[README] = filled(pages[README], "comparison", summary(comparisons))
+    return pages
 
 
 def main() -> None:
-    readme = ROOT / "README.md"
-    pages = {readme: readme.read_text()}
-    for folder in sorted(path.parent for path in (ROOT / "benchmarks").glob("*/report.json")):
-        pages[ROOT / "docs" / "results" / f"{folder.name}.md"] = page(folder)
-        pages[readme] = filled(pages[readme], folder.name, markdown(results(folder)).rstrip())
-    for path in sorted((ROOT / "benchmarks" / "latency").glob("latency-*.json")):
-        pages[ROOT / "docs" / "results" / f"{path.stem}.md"] = latency_page(path)
-    for folder in sorted(path.parent for path in (ROOT / "benchmarks" / "diversity").glob("*/sweep.json")):
-        pages[ROOT / "docs" / "results" / f"diversity-{folder.name}.md"] = diversity_page(folder)
-    if (ROOT / "benchmarks" / "environments" / "speed.json").exists():
-        pages[ROOT / "docs" / "results" / "environments.md"] = environments_page(
-            ROOT / "benchmarks" / "environments"
-        )
-    found = {path: committed(path) for path in sorted(COMPARISON.glob("*.yaml"))}
-    comparisons = {path: entry for path, entry in found.items() if entry is not None}
-    for path, entry in comparisons.items():
-        page_path = ROOT / "docs" / "results" / f"comparison-{path.stem}.md"
-        pages[page_path] = comparison_page(path, *entry, draw="--check" not in sys.argv)
-    pages[readme] = filled(pages[readme], "comparison", summary(comparisons))
-    stale = [path for path, text in pages.items() if not path.exists() or path.read_text() != text]
+    pages = render(draw="--check" not in sys.argv)
+    stale = [path for path, page in pages.items() if not path.exists() or path.read_text() != page]
     if "--check" in sys.argv:
         sys.exit(f"out of date, run benchmarks/render.py: {[str(p) for p in stale]}" if stale else 0)
     for path in stale:

@@ -16,8 +16,8 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies import get_policy_class
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from lerobot_agpd.analysis.latency import chunk_latency
-from lerobot_agpd.comparison.provenance import provenance
+from lerobot_agpd.studies.latency import chunk_latency
+from lerobot_agpd.studies.provenance import provenance
 
 FEATURES = {
     "input_features": {

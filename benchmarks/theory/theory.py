@@ -13,17 +13,16 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy.optimize import brentq
 
-from lerobot_agpd.analysis.theory import (
+from lerobot_agpd.studies.theory_coverage import best_coverage_bound, coverage_probability
+from lerobot_agpd.studies.theory_guidance import (
     Mixing,
     Policies,
     Tilt,
-    best_coverage_bound,
     compare,
-    coverage_probability,
+    fraction_at_equal_variance,
     guide,
     kl_to_teacher,
     mix,
-    share_at_equal_variance,
 )
 
 HERE = Path(__file__).parent
@@ -46,7 +45,7 @@ def four_cases(rng: np.random.Generator) -> dict:
         lam = rng.uniform(0, 1)
         threshold = var_teacher / (var_teacher + var_student)
         for tilt, mixing in CASES:
-            share = share_at_equal_variance(policies, lam, tilt, mixing)
+            share = fraction_at_equal_variance(policies, lam, tilt, mixing)
             if not 0 <= share <= 1:
                 continue
             tables = [counts] + ([below] if mixing is Mixing.INTERPOLATE and lam < threshold else [])
@@ -69,7 +68,7 @@ def examples() -> dict:
         found[name] = {
             "lambda": 0.3,
             "k": result.k,
-            "share_guided": result.guided.share,
+            "share_guided": result.guided.fraction,
             "variance": result.guided.variance,
             "kl_guided": float(result.kl_guided),
             "kl_mixed": float(result.kl_mixed),
@@ -118,7 +117,9 @@ def coverage_of_student(policies: Policies, law, sigma_s: float) -> float:
     """P_S of the student's next states, s' = s + a + noise, in data collected with `law`'s actions."""
     sigma = float(np.sqrt(sigma_s**2 + law.variance))
     sigma_test = float(np.sqrt(sigma_s**2 + policies.var_student))
-    return coverage_probability(sigma, EPSILON, N, policies.dim, sigma_test, (1 - law.share) * policies.gap)
+    return coverage_probability(
+        sigma, EPSILON, N, policies.dim, sigma_test, (1 - law.fraction) * policies.gap
+    )
 
 
 def guided_at(policies: Policies, share: float):
@@ -168,14 +169,14 @@ def plot_shares(axes, policies: Policies, tilt: Tilt, title: str, labels: dict) 
     lam = np.linspace(0, 1, 401)
     axes.fill_between(lam, lam, 1, color="0.93", lw=0)
     axes.plot(lam, lam, color="0.35", lw=1.2, ls=":")
-    for mixing, label, colour in (
+    for mixing, label, color in (
         (Mixing.SWITCH, "against choosing\none (Eq. 7)", "C0"),
         (Mixing.INTERPOLATE, "against interpo-\nlating (Eq. 6)", "C1"),
     ):
-        share = np.array([share_at_equal_variance(policies, x, tilt, mixing) for x in lam])
+        share = np.array([fraction_at_equal_variance(policies, x, tilt, mixing) for x in lam])
         share[(share < 0) | (share > 1)] = np.nan
-        axes.plot(lam, share, color=colour, lw=2)
-        axes.text(*labels[mixing], label, color=colour)
+        axes.plot(lam, share, color=color, lw=2)
+        axes.text(*labels[mixing], label, color=color)
     threshold = policies.var_teacher / (policies.var_teacher + policies.var_student)
     axes.plot(threshold, threshold, "o", color="C1", ms=6, zorder=3)
     axes.text(0.03, 0.93, "guidance farther from teacher", color="0.35", va="top")
@@ -222,18 +223,18 @@ def picture(numbers: dict) -> None:
     axes.set_title(f"c  More noise, more coverage?\nd = 2, N = {N}, " + rf"$\epsilon$ = {EPSILON}")
 
     axes, data = grid[1, 1], numbers["pull"]
-    for name, label, colour in (("guided", "guidance", "C0"), ("interpolated", "interpolation", "C1")):
+    for name, label, color in (("guided", "guidance", "C0"), ("interpolated", "interpolation", "C1")):
         kl, coverage = ([row[key] for row in data[name]] for key in ("kl", "coverage"))
-        axes.plot(kl, coverage, color=colour, lw=2, label=label)
+        axes.plot(kl, coverage, color=color, lw=2, label=label)
         for share in (0.3, 0.5, 0.7):
             at = int(np.argmin(np.abs(np.array(data["share"]) - share)))
-            axes.plot(kl[at], coverage[at], "o", color=colour, ms=5)
+            axes.plot(kl[at], coverage[at], "o", color=color, ms=5)
             axes.annotate(
                 f"{share:.1f}",
                 (kl[at], coverage[at]),
                 textcoords="offset points",
                 xytext=(5, -11),
-                color=colour,
+                color=color,
             )
     axes.set(xlim=(0, 3.2), ylim=(0.4, 1.02), xlabel="KL from the teacher (nats, Eq. 14)")
     axes.set_ylabel("coverage $P_S$ of the student's next states")

@@ -1,26 +1,53 @@
-"""What the commands share: how they start, and how they end where the user can put it right."""
+"""How every command starts, reads its flags, and ends."""
 
 from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Iterator
+from argparse import ArgumentError
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
+from typing import get_type_hints
 
+import draccus
 from draccus.utils import DraccusException
+from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
-from lerobot.utils.utils import init_logging
+from lerobot.utils.utils import has_method, init_logging
 
-from lerobot_agpd.comparison.matrix import reason
+from lerobot_agpd.studies.parsing import load_plugins, reason
 
 logger = logging.getLogger(__name__)
 
-WRONG_INPUT = (ValueError, FileNotFoundError, FileExistsError, ModuleNotFoundError)
+WRONG_INPUT = (ValueError, FileNotFoundError, FileExistsError, ModuleNotFoundError, ArgumentError)
+
+
+def entry_point[C](name: str) -> Callable[[Callable[[C], None]], Callable[[], None]]:
+    """Make a console entry point of a function whose only parameter is a dataclass of flags.
+
+    `--<field>.discover_packages_path=<package>` imports a package that registers types, as in LeRobot's commands, and
+    `--<field>.path` is left to the `__post_init__` of a dataclass that names the field in `__get_path_fields__`.
+
+    Args:
+        name: of the command, as error messages begin.
+    """
+
+    def decorate(function: Callable[[C], None]) -> Callable[[], None]:
+        @wraps(function)
+        def main() -> None:
+            (config_class,) = (kind for key, kind in get_type_hints(function).items() if key != "return")
+            with command(name):
+                function(_parse(config_class, sys.argv[1:]))
+
+        return main
+
+    return decorate
 
 
 @contextmanager
 def command(name: str) -> Iterator[None]:
-    """Logging and plugins are set up; wrong input ends the command with one line instead of a traceback.
+    """Set up logging and plugins; wrong input ends the command with one line instead of a traceback.
 
     Args:
         name: of the command, as the line begins.
@@ -29,8 +56,19 @@ def command(name: str) -> Iterator[None]:
     register_third_party_plugins()
     try:
         yield
-    except DraccusException as error:  # hides what a `__post_init__` says
+    except DraccusException as error:  # hides the message of a `__post_init__`
         sys.exit(f"{name}: {reason(error)}")
     except WRONG_INPUT as error:
         logger.debug("the traceback:", exc_info=True)
         sys.exit(f"{name}: {error}")
+
+
+def _parse[C](config_class: type[C], args: list[str]) -> C:
+    """Parse flags as `lerobot.configs.parser.wrap` does, but raise what is wrong with them."""
+    args = load_plugins(args)
+    if "--help" in args or "-h" in args:
+        parser.print_scoped_help(config_class, args)
+        sys.exit(0)
+    if has_method(config_class, "__get_path_fields__"):
+        args = parser.filter_path_args(config_class.__get_path_fields__(), args)
+    return draccus.parse(config_class=config_class, args=args)

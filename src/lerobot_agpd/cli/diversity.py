@@ -4,26 +4,27 @@ import json
 import logging
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import draccus
 import torch
-from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig
 from rich.console import Console
 from rich.table import Table
 
-from lerobot_agpd.analysis.frontier import plot_frontier, plot_trajectories
-from lerobot_agpd.cli.command import command
+from lerobot_agpd.cli.command import entry_point
 from lerobot_agpd.collect.config import EVALUATION_SEEDS
 from lerobot_agpd.collect.deciders.pair import PairDecider
 from lerobot_agpd.collect.strategies import make_strategy
-from lerobot_agpd.collect.sweep import Setting, Sweep, SweepRow, configured
 from lerobot_agpd.collect.witness import Witness
 from lerobot_agpd.distill.guided import Proposer
 from lerobot_agpd.distill.loading import load_pair, require_student, student_config_from_command_line
+from lerobot_agpd.files import write_json
 from lerobot_agpd.guidance.config import TeacherConfig
 from lerobot_agpd.guidance.teacher import Teacher
+from lerobot_agpd.studies.frontier import plot_frontier, plot_trajectories
+from lerobot_agpd.studies.sweep import Setting, Sweep, SweepRow, configured
 
 logger = logging.getLogger(__name__)
 
@@ -35,16 +36,26 @@ STUDENT = Setting("interpolate", 1.0)
 class DiversityConfig:
     """Options of `lerobot-agpd-diversity`."""
 
-    env: EnvConfig  # environment to act in
-    output: Path  # folder of sweep.json, frontier.png and trajectories.png
-    policy: PreTrainedConfig | None = None  # the student: --policy.path=<checkpoint of a distilled policy>
-    teacher: TeacherConfig = field(default_factory=TeacherConfig)  # what is not set is the checkpoint's
-    scales: list[float] = field(default_factory=lambda: [0.5, 2.0, 8.0, 32.0, 128.0])  # of guidance
-    lambdas: list[float] = field(default_factory=lambda: [0.05, 0.1, 0.2, 0.4, 0.7])  # of mixing
-    forms: list[str] = field(default_factory=lambda: ["interpolate", "switch"])  # of mixing
-    episodes: int = 40  # episodes per setting, from the same environment seeds
-    seed: int = EVALUATION_SEEDS[0] + 500_000  # first environment seed; also seeds the noise
-    axes: list[int] = field(default_factory=lambda: [0, 1])  # state dimensions of the trajectories' picture
+    # environment to act in
+    env: EnvConfig
+    # folder of sweep.json, frontier.png and trajectories.png
+    output: Path
+    # the student: --policy.path=<checkpoint of a distilled policy>
+    policy: PreTrainedConfig | None = None
+    # flags that are not set are the checkpoint's
+    teacher: TeacherConfig = field(default_factory=TeacherConfig)
+    # scales of guidance
+    scales: list[float] = field(default_factory=lambda: [0.5, 2.0, 8.0, 32.0, 128.0])
+    # weights of mixing
+    lambdas: list[float] = field(default_factory=lambda: [0.05, 0.1, 0.2, 0.4, 0.7])
+    # forms of mixing
+    forms: list[Literal["interpolate", "switch"]] = field(default_factory=lambda: ["interpolate", "switch"])
+    # episodes per setting, from the same environment seeds
+    episodes: int = 40
+    # first environment seed; also seeds the noise
+    seed: int = EVALUATION_SEEDS[0] + 500_000
+    # state dimensions of the trajectories' picture
+    axes: list[int] = field(default_factory=lambda: [0, 1])
 
     def __post_init__(self) -> None:
         """Read the checkpoint's configuration and check the options.
@@ -59,8 +70,6 @@ class DiversityConfig:
             raise ValueError(f"--scales must be positive, got {self.scales}")
         if any(not 0 < weight < 1 for weight in self.lambdas):
             raise ValueError(f"--lambdas must lie between 0 and 1, got {self.lambdas}")
-        if unknown := set(self.forms) - {"interpolate", "switch"}:
-            raise ValueError(f"--forms must be interpolate or switch, got {sorted(unknown)}")
         if len(self.axes) != 2:
             raise ValueError(f"--axes must name two state dimensions, got {self.axes}")
 
@@ -73,7 +82,7 @@ class DiversityConfig:
     def settings(self) -> list[Setting]:
         """The teacher alone, then every strategy at every strength."""
         return [
-            Setting("replay"),
+            Setting("teacher"),
             *(Setting("guided", scale) for scale in self.scales),
             *(Setting(form, weight) for form in self.forms for weight in self.lambdas),
         ]
@@ -106,19 +115,19 @@ def sweep_settings(config: DiversityConfig) -> tuple[list[SweepRow], dict[str, l
         episodes = sweep.episodes(watched if history is None else decider, setting)
         history = history if history is not None else watched.history()  # the teacher's own decisions
         rows.append(sweep.measure(setting, decider, episodes, history, student_states))
-        if setting.strategy in ("replay", "guided"):
-            shown["teacher" if setting.strategy == "replay" else "guided"] = episodes
+        if setting.strategy in ("teacher", "guided"):
+            shown[setting.strategy] = episodes
         logger.info("%s", json.dumps(rows[-1].to_json()))
     return rows, shown
 
 
-def table(rows: list[SweepRow]) -> Table:
+def console_table(rows: list[SweepRow]) -> Table:
     """The sweep for the console."""
-    shown = Table(
+    table = Table(
         "strategy", "strength", "success", "rms to teacher", "rms to student", "entropy", "coverage"
     )
     for row in rows:
-        shown.add_row(
+        table.add_row(
             row.setting.strategy,
             f"{row.setting.strength:g}",
             f"{row.success:.2f}",
@@ -127,11 +136,11 @@ def table(rows: list[SweepRow]) -> Table:
             "-" if row.entropy is None else f"{row.entropy:.2f}",
             f"{row.coverage:.2f}",
         )
-    return shown
+    return table
 
 
-@parser.wrap()
-def run(config: DiversityConfig) -> None:
+@entry_point("lerobot-agpd-diversity")
+def main(config: DiversityConfig) -> None:
     """Sweep, write and show."""
     rows, shown = sweep_settings(config)
     config.output.mkdir(parents=True, exist_ok=True)
@@ -142,17 +151,11 @@ def run(config: DiversityConfig) -> None:
         "episodes": config.episodes,
         "rows": [row.to_json() for row in rows],
     }
-    (config.output / "sweep.json").write_text(json.dumps(content, default=str, indent=1) + "\n")
+    write_json(config.output / "sweep.json", content, indent=1)
     plot_frontier(content["rows"], config.output / "frontier.png")
     plot_trajectories(shown, (config.axes[0], config.axes[1]), config.output / "trajectories.png")
-    Console().print(table(rows))
+    Console().print(console_table(rows))
     logger.info("numbers and pictures in %s", config.output)
-
-
-def main() -> None:
-    """Console entry point."""
-    with command("lerobot-agpd-diversity"):
-        run()
 
 
 if __name__ == "__main__":

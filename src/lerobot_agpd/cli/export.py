@@ -5,7 +5,6 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import draccus
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy, get_policy_class, make_pre_post_processors
 from lerobot.policies.act.configuration_act import ACTConfig
@@ -14,13 +13,13 @@ from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 from lerobot.utils.random_utils import seeded_context
 
-from lerobot_agpd.analysis.latency import random_observations
-from lerobot_agpd.cli.command import command
+from lerobot_agpd.cli.command import entry_point
 from lerobot_agpd.guidance.loading import read_policy_config
 from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
     DiffusionTransformerConfig,
 )
+from lerobot_agpd.studies.latency import random_observations
 
 logger = logging.getLogger(__name__)
 
@@ -32,10 +31,14 @@ TOLERANCE = 1e-6
 class ExportConfig:
     """Options of `lerobot-agpd-export`."""
 
-    checkpoint: str  # pretrained_model folder (or Hub repository) of a student or teacher of this plugin
-    output: Path  # folder of the plain checkpoint; must not exist
-    repo_id: str | None = None  # Hub repository to upload to
-    push_to_hub: bool = False  # upload the result
+    # pretrained_model folder (or Hub repository) of a student or teacher of this plugin
+    checkpoint: str
+    # folder of the plain checkpoint; must not exist
+    output: Path
+    # Hub repository to upload to
+    repo_id: str | None = None
+    # upload the result
+    push_to_hub: bool = False
 
     def __post_init__(self) -> None:
         if self.output.exists():
@@ -45,7 +48,7 @@ class ExportConfig:
 
 
 def as_plain(policy: PreTrainedPolicy) -> PreTrainedPolicy:
-    """The same acting network as a policy of LeRobot's own; what only trained it stays behind.
+    """Copy the acting network into one of LeRobot's own policies; what only trained it stays behind.
 
     Raises:
         ValueError: if LeRobot has no such network.
@@ -55,11 +58,9 @@ def as_plain(policy: PreTrainedPolicy) -> PreTrainedPolicy:
         return _as(ACTPolicy, ACTConfig, "model.", policy)
     if isinstance(config, DiffusionTransformerConfig) and config.denoiser == "unet":
         return _as(DiffusionPolicy, DiffusionConfig, "diffusion.", policy)
-    found = f"'{config.type}'" + (
-        f" with denoiser '{config.denoiser}'" if hasattr(config, "denoiser") else ""
-    )
+    kind = f"'{config.type}'" + (f" with denoiser '{config.denoiser}'" if hasattr(config, "denoiser") else "")
     raise ValueError(
-        f"--checkpoint is a {found} policy, for which LeRobot has no network of its own; 'agpd' exports to 'act', "
+        f"--checkpoint is a {kind} policy, for which LeRobot has no network of its own; 'agpd' exports to 'act', "
         "and diffusion policies of this plugin with --policy.denoiser=unet export to 'diffusion'"
     )
 
@@ -117,20 +118,14 @@ def export(config: ExportConfig) -> PreTrainedPolicy:
     return plain
 
 
-@draccus.wrap()
-def run(config: ExportConfig) -> None:
+@entry_point("lerobot-agpd-export")
+def main(config: ExportConfig) -> None:
     """Export and optionally upload."""
     plain = export(config)
     if config.push_to_hub:
         plain.push_to_hub(str(config.repo_id))
         for processor in make_pre_post_processors(plain.config, pretrained_path=str(config.output)):
             processor.push_to_hub(str(config.repo_id))
-
-
-def main() -> None:
-    """Console entry point."""
-    with command("lerobot-agpd-export"):
-        run()
 
 
 if __name__ == "__main__":

@@ -12,18 +12,14 @@ import gymnasium as gym
 import numpy as np
 import rerun as rr
 import torch
-from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors
 from rich.console import Console
 from rich.table import Table
 
-from lerobot_agpd.analysis.recording import Array, RolloutRecord
-from lerobot_agpd.analysis.rerun_log import blueprint, layout, log_rollout
-from lerobot_agpd.analysis.still import draw_still
-from lerobot_agpd.cli.command import command
+from lerobot_agpd.cli.command import entry_point
 from lerobot_agpd.collect.config import EVALUATION_SEEDS
 from lerobot_agpd.collect.deciders.teacher import GuidedTeacher
-from lerobot_agpd.collect.recorders import DecisionRecorder, FrameRecorder
 from lerobot_agpd.collect.rollout import Rollouts
 from lerobot_agpd.distill.loading import load_pair, require_student, student_config_from_command_line
 from lerobot_agpd.distill.state import DistillationState, replay_root
@@ -31,6 +27,9 @@ from lerobot_agpd.guidance.config import TeacherConfig
 from lerobot_agpd.replay.episode import Episode, Ticket
 from lerobot_agpd.replay.store import ReplayStore
 from lerobot_agpd.run import RunInfo
+from lerobot_agpd.studies.recording import Array, DecisionRecorder, FrameRecorder, RolloutRecord
+from lerobot_agpd.studies.rerun_log import blueprint, layout, log_rollout
+from lerobot_agpd.studies.still import draw_still
 
 logger = logging.getLogger(__name__)
 
@@ -41,16 +40,26 @@ APPLICATION = "lerobot-agpd-viz"
 class VizConfig:
     """Options of `lerobot-agpd-viz`."""
 
-    env: EnvConfig  # environment to act in
-    policy: PreTrainedConfig | None = None  # the student: --policy.path=<checkpoint of a distilled policy>
-    teacher: TeacherConfig = field(default_factory=TeacherConfig)  # what is not set is the checkpoint's
-    episodes: int = 1  # episodes to record
-    seed: int = EVALUATION_SEEDS[0]  # environment seed of the first episode; also seeds the noise
-    scale: float | None = None  # guidance scale; default: that of the run's next round, else the policy's
-    output: Path = Path("outputs/rollout.rrd")  # recording to write
-    png: Path | None = None  # still picture of the first episode to draw
-    render: bool = True  # record rendered frames
-    open: bool = False  # show the finished recording in a rerun viewer
+    # environment to act in
+    env: EnvConfig
+    # the student: --policy.path=<checkpoint of a distilled policy>
+    policy: PreTrainedConfig | None = None
+    # flags that are not set are the checkpoint's
+    teacher: TeacherConfig = field(default_factory=TeacherConfig)
+    # episodes to record
+    episodes: int = 1
+    # environment seed of the first episode; also seeds the noise
+    seed: int = EVALUATION_SEEDS[0]
+    # guidance scale; default: that of the run's next round, else the policy's
+    scale: float | None = None
+    # recording to write
+    output: Path = Path("outputs/rollout.rrd")
+    # still picture of the first episode to draw
+    png: Path | None = None
+    # record rendered frames
+    render: bool = True
+    # show the finished recording in a rerun viewer
+    open: bool = False
 
     def __post_init__(self) -> None:
         """Read the checkpoint's configuration and check the options.
@@ -153,7 +162,7 @@ def plane_to_frame(space: gym.Space, frame: Array | None) -> Callable[[Array], A
 # ---- the command ----
 
 
-def visualise(config: VizConfig) -> Table:
+def visualize(config: VizConfig) -> Table:
     """Record the rollouts, and draw the still if one is wanted.
 
     Returns:
@@ -182,8 +191,8 @@ def visualise(config: VizConfig) -> Table:
 
 def _row(episode: Episode, rollout: RolloutRecord) -> tuple[str, ...]:
     success = "-" if episode.success is None else str(episode.success)
-    alone = np.mean([decision.j_teacher for decision in rollout.decisions])
-    guided = np.mean([decision.j_guided for decision in rollout.decisions])
+    alone = np.mean([decision.teacher_discrepancy for decision in rollout.decisions])
+    guided = np.mean([decision.guided_discrepancy for decision in rollout.decisions])
     return (
         str(episode.ticket.seed),
         str(len(episode)),
@@ -194,22 +203,16 @@ def _row(episode: Episode, rollout: RolloutRecord) -> tuple[str, ...]:
     )
 
 
-@parser.wrap()
-def run(config: VizConfig) -> None:
+@entry_point("lerobot-agpd-viz")
+def main(config: VizConfig) -> None:
     """Record and report."""
-    table = visualise(config)
+    table = visualize(config)
     Console().print(table)
     logger.info("recording in %s (open it with `rerun %s`)", config.output, config.output)
     if config.png is not None:
         logger.info("still picture in %s", config.png)
     if config.open:  # in a process of its own, which outlives this one
         subprocess.Popen([sys.executable, "-m", "rerun", str(config.output)], start_new_session=True)
-
-
-def main() -> None:
-    """Console entry point."""
-    with command("lerobot-agpd-viz"):
-        run()
 
 
 if __name__ == "__main__":

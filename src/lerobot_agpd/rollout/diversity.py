@@ -1,4 +1,4 @@
-"""How diverse a set of rollouts is: entropy and coverage of states, divergence of actions.
+"""Measures of diversity: entropy and coverage of states, divergence of Gaussians over actions.
 
 Features are numpy arrays, one row per state or action. Entropy and coverage depend on the features' units:
 standardize every set that is compared with the *same* statistics, best those of the demonstrations.
@@ -19,7 +19,7 @@ Array = NDArray[np.floating]
 
 
 def standardize(features: ArrayLike, mean: ArrayLike, std: ArrayLike) -> Array:
-    """(features - mean) / std with given statistics.
+    """Compute (features - mean) / std with given statistics.
 
     Args:
         features: (N, D).
@@ -34,11 +34,11 @@ def standardize(features: ArrayLike, mean: ArrayLike, std: ArrayLike) -> Array:
         raise ValueError(
             f"standard deviations must be positive, not so at {np.flatnonzero(~(spread > 0)).tolist()}"
         )
-    return (_rows(features, "features") - np.asarray(mean, dtype=float)) / spread
+    return (_points(features, "features") - np.asarray(mean, dtype=float)) / spread
 
 
 def knn_entropy(states: ArrayLike, k: int = 3) -> float:
-    """Differential entropy in nats from k-nearest-neighbor distances.
+    """Estimate differential entropy in nats from k-nearest-neighbor distances.
 
     Kozachenko and Leonenko (1987): h = digamma(N) - digamma(k) + log V_D + D / N sum log r, with r the Euclidean
     distance to the k-th other point and V_D the volume of the unit ball. It assumes independent points: states of one
@@ -51,7 +51,7 @@ def knn_entropy(states: ArrayLike, k: int = 3) -> float:
     Raises:
         ValueError: for fewer than k + 1 points, or if a point has k exact copies, where the entropy is -inf.
     """
-    points = _rows(states, "states")
+    points = _points(states, "states")
     n, dim = points.shape
     if k < 1 or n < k + 1:
         raise ValueError(f"the {k}-th neighbor needs k >= 1 and at least k + 1 = {k + 1} states, got {n}")
@@ -67,7 +67,7 @@ def knn_entropy(states: ArrayLike, k: int = 3) -> float:
 
 
 def state_coverage(test: ArrayLike, train: ArrayLike, epsilon: float) -> float:
-    """Share of test states with a training state within epsilon: the next-state coverage P_S, measured.
+    """Measure the next-state coverage P_S: the fraction of test states with a training state within epsilon.
 
     The quantity that Eq. 4-5 bound (Belkhale et al. 2023, arXiv:2306.02437), over all visited states rather than the
     successors of one.
@@ -80,12 +80,12 @@ def state_coverage(test: ArrayLike, train: ArrayLike, epsilon: float) -> float:
     Raises:
         ValueError: for empty sets, or sets of different dimension.
     """
-    queries, known = _rows(test, "test"), _rows(train, "train")
-    if queries.shape[1] != known.shape[1]:
-        raise ValueError(f"test states have {queries.shape[1]} features, training states {known.shape[1]}")
+    queries, points = _points(test, "test"), _points(train, "train")
+    if queries.shape[1] != points.shape[1]:
+        raise ValueError(f"test states have {queries.shape[1]} features, training states {points.shape[1]}")
     if epsilon <= 0:
         raise ValueError(f"epsilon must be positive, got {epsilon}")
-    return float(np.mean(cKDTree(known).query(queries)[0] <= epsilon))
+    return float(np.mean(cKDTree(points).query(queries)[0] <= epsilon))
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class Gaussian:
 
 
 def match_moments(samples: ArrayLike, shrinkage: float = 0.1) -> Gaussian:
-    """Gaussian with the samples' mean and shrunk covariance.
+    """Fit a Gaussian with the samples' mean and shrunk covariance.
 
     The covariance becomes (1 - shrinkage) S + shrinkage (tr S / D) I, because S of N <= D samples is singular. The
     trace, the total variance, is kept. Use the same shrinkage for everything that is compared.
@@ -109,7 +109,7 @@ def match_moments(samples: ArrayLike, shrinkage: float = 0.1) -> Gaussian:
     Raises:
         ValueError: for fewer than two samples, or samples that are all equal.
     """
-    points = _rows(samples, "samples")
+    points = _points(samples, "samples")
     if len(points) < 2 or not 0 <= shrinkage <= 1:
         raise ValueError(
             f"need at least 2 samples and shrinkage in [0, 1], got {len(points)} and {shrinkage}"
@@ -123,7 +123,7 @@ def match_moments(samples: ArrayLike, shrinkage: float = 0.1) -> Gaussian:
 
 
 def gaussian_kl(p: Gaussian, q: Gaussian) -> float:
-    """KL(p || q) in nats (Eq. 14).
+    """Compute KL(p || q) in nats (Eq. 14).
 
     Raises:
         ValueError: if either covariance is singular.
@@ -135,15 +135,15 @@ def gaussian_kl(p: Gaussian, q: Gaussian) -> float:
     return float(0.5 * (trace - len(gap) + log_ratio + gap @ cho_solve((factor_q, True), gap)))
 
 
-def _rows(values: ArrayLike, name: str) -> Array:
-    rows = np.asarray(values, dtype=float)
-    if rows.ndim != 2 or rows.size == 0 or not np.all(np.isfinite(rows)):
-        raise ValueError(f"{name} must be a non-empty finite array (N, D), got shape {rows.shape}")
-    return rows
+def _points(values: ArrayLike, name: str) -> Array:
+    points = np.asarray(values, dtype=float)
+    if points.ndim != 2 or points.size == 0 or not np.all(np.isfinite(points)):
+        raise ValueError(f"{name} must be a non-empty finite array (N, D), got shape {points.shape}")
+    return points
 
 
 def _cholesky(covariance: Array, name: str) -> Array:
-    """Lower factor; numerically singular matrices are refused."""
+    """Lower Cholesky factor; numerically singular matrices are refused."""
     try:
         factor = cho_factor(covariance, lower=True)[0]
     except LinAlgError:

@@ -1,0 +1,119 @@
+"""Read committed results, whichever words they were made with, as today's package names them.
+
+The JSON files stay as they were written; flags and keys were renamed since. Rendering and the tests go through here.
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from lerobot_agpd.studies.evaluation import Evaluation
+from lerobot_agpd.studies.latency import Latency
+from lerobot_agpd.studies.results import Result, RunResult
+from lerobot_agpd.studies.run_results import read_result
+
+Json = dict[str, Any]
+
+RENAMED_FLAGS = {
+    "policy.collect.mixing.relabel": "policy.collect.mixing.record_teacher",
+    "policy.collect.unguided_fraction": "policy.collect.teacher_only_fraction",
+    "policy.replay.collected_share": "policy.replay.collected_fraction",
+}
+RENAMED_VALUES = {
+    ("policy.collect.strategy", "replay"): "teacher",
+    ("env.type", "robomimic"): "robosuite_robomimic",
+}
+
+
+def flags(old: Mapping[str, Any]) -> Json:
+    """Dotted flags under today's names; groups that are constants now keep theirs, and no longer exist."""
+    renamed = {RENAMED_FLAGS.get(name, name): value for name, value in old.items()}
+    return {
+        name: RENAMED_VALUES.get((name, value), value) if isinstance(value, str) else value
+        for name, value in renamed.items()
+    }
+
+
+def strategy(name: str) -> str:
+    """A strategy's name."""
+    return str(RENAMED_VALUES.get(("policy.collect.strategy", name), name))
+
+
+def tally(old: Mapping[str, int]) -> Json:
+    """Counted episodes of one kind."""
+    return {("solved_at_start" if key == "trivial" else key): value for key, value in old.items()}
+
+
+def round_report(old: Mapping[str, Any]) -> Json:
+    """The report of a collection round, without its episodes."""
+    if "tallies" in old:
+        return dict(old)
+    nothing = {"generated": 0, "trivial": 0, "successful": 0, "kept": 0}
+    environment = old["environment"]
+    if isinstance(environment, Mapping) and "type" in environment:
+        type_ = RENAMED_VALUES.get(("env.type", environment["type"]), environment["type"])
+        environment = {**environment, "type": type_}
+    return {
+        "round": old["round"],
+        "identity": {
+            "strategy": strategy(old["strategy"]),
+            "environment": environment,
+            "teacher": old["teacher"],
+            "seed": old.get("seed"),
+        },
+        "strength": old["scale"],
+        "next_scale": old["next_scale"],
+        "updates": old["updates"],
+        **tally({key: old[key] for key in nothing}),
+        "kept_frames": old["kept_frames"],
+        "tallies": {
+            "strategy": tally(old["guided"]),
+            "teacher_only": tally(old["unguided"]),
+            "retried": tally(old.get("retried", nothing)),
+            "student_alone": tally(old.get("student_alone", nothing)),
+        },
+        "mean_max_reward": old["mean_max_reward"],
+        "mean_discrepancy": {"strategy": old["mean_j_guided"], "teacher_only": old["mean_j_unguided"]},
+        "mean_guidance_shift": old["mean_shift_in_sigmas"],
+        "mean_student_steps": old.get("mean_student_steps"),
+        "seconds": old["seconds"],
+        "diagnostics": old.get("diagnostics"),
+    }
+
+
+def run(content: Json) -> Json:
+    """A `run.json`."""
+    rounds = [round_report(entry) for entry in content["rounds"]]
+    return {**content, "flags": flags(content["flags"]), "rounds": rounds}
+
+
+def read_run(run_: Any, matrix: Any) -> RunResult | None:
+    """The committed result of a run of a matrix."""
+    return read_result(run_, matrix, translate=run)
+
+
+def read_report(path: Path) -> list[Result]:
+    """The rows of a `report.json`; intervals are computed anew."""
+    return [
+        Result(
+            name=entry["name"],
+            finals={"last": Evaluation(**entry["final"])},
+            latency=Latency(**entry["latency"]),
+            curve={int(step): Evaluation(**values) for step, values in entry["curve"].items()},
+            rounds=[
+                round_report(round_)
+                for round_ in entry.get("rounds") or entry.get("collection", {}).get("rounds", [])
+            ],
+        )
+        for entry in json.loads(path.read_text())["methods"]
+    ]
+
+
+def read_sweep(path: Path) -> list[Json]:
+    """The rows of a `sweep.json`."""
+    rows: list[Json] = json.loads(path.read_text())["rows"]
+    return [
+        {**row, "setting": {**row["setting"], "strategy": strategy(row["setting"]["strategy"])}}
+        for row in rows
+    ]

@@ -1,1 +1,0 @@
-"""Pictures and recordings of what a run did."""

@@ -1,1 +1,0 @@
-"""A fair comparison: tasks x methods x training seeds from one YAML, run, evaluated and reported."""

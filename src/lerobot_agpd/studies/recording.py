@@ -1,0 +1,182 @@
+"""Records of a guided rollout: its steps, its frames, and what teacher and student planned at every decision."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.vector import VectorEnv, VectorWrapper
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lerobot_agpd.collect.decider import Decision
+from lerobot_agpd.collect.deciders.teacher import GuidedTeacher
+from lerobot_agpd.collect.stopwatch import Stopwatch
+from lerobot_agpd.guidance.teacher import History
+
+Array = NDArray[Any]
+
+COLORS = {"teacher": (0, 114, 178), "guided": (213, 94, 0), "student": (230, 60, 180)}
+LABELS = {"teacher": "teacher alone", "guided": "guided teacher", "student": "student"}
+
+
+@dataclass(frozen=True)
+class Chunks:
+    """The three chunks of one decision, (n, A) in the environment's units.
+
+    Attributes:
+        teacher: without guidance, from the same initial noise as `guided`.
+        guided: pulled toward the student; executed.
+        student: what it was pulled toward.
+    """
+
+    teacher: Array
+    guided: Array
+    student: Array
+
+    def items(self) -> list[tuple[str, Array]]:
+        """Names and chunks."""
+        return [(field.name, getattr(self, field.name)) for field in fields(self)]
+
+
+@dataclass(frozen=True)
+class DecisionRecord:
+    """One decision of a rollout.
+
+    Attributes:
+        step: environment step at which the chunks begin.
+        chunks: the three chunks.
+        teacher_discrepancy: J between the teacher's own chunk and the student's.
+        guided_discrepancy: J between the executed chunk and the student's.
+        guidance_shift: mean shift of the guided denoising steps, in sigmas; NaN without guidance.
+    """
+
+    step: int
+    chunks: Chunks
+    teacher_discrepancy: float
+    guided_discrepancy: float
+    guidance_shift: float
+
+
+@dataclass(frozen=True)
+class RolloutRecord:
+    """A rollout of T steps.
+
+    Attributes:
+        observations: feature name to (T, D) vectors or (T, H, W, C) uint8 images.
+        actions: (T, A) as executed.
+        rewards: (T,).
+        successes: (T,) bool, or None if the environment does not say.
+        decisions: in the order of their steps.
+        frames: T rendered frames (H, W, 3) uint8, or none.
+        to_frame: maps actions (n, 2) to pixels (n, 2) of the frame; None if actions are no positions in it.
+    """
+
+    observations: Mapping[str, Array]
+    actions: Array
+    rewards: Array
+    successes: Array | None
+    decisions: Sequence[DecisionRecord]
+    frames: Sequence[Array] = ()
+    to_frame: Callable[[Array], Array] | None = None
+
+    @property
+    def cameras(self) -> list[str]:
+        """Observations that are images."""
+        return [key for key, values in self.observations.items() if values.ndim == 4]
+
+    @property
+    def vectors(self) -> list[str]:
+        """Observations that are vectors."""
+        return [key for key, values in self.observations.items() if values.ndim == 2]
+
+
+class DecisionRecorder:
+    """Decide as a guided teacher does, and record what the teacher alone and the student would have done.
+
+    For one environment.
+
+    Attributes:
+        decisions: of the running episode; the caller takes them and clears the list.
+    """
+
+    def __init__(self, guided: GuidedTeacher):
+        self.guided = guided
+        self.decisions: list[DecisionRecord] = []
+
+    @property
+    def n_obs_steps(self) -> int:
+        """The guided teacher's."""
+        return self.guided.n_obs_steps
+
+    @property
+    def stopwatch(self) -> Stopwatch:
+        """The guided teacher's."""
+        return self.guided.stopwatch
+
+    def decide(self, history: History, strength: Tensor, rolling_in: Tensor | None = None) -> Decision:
+        """The guided decision; the unguided one is drawn first, from the same noise."""
+        noise = self.guided.generator.get_state()
+        alone = self.guided.decide(history, torch.zeros_like(strength))
+        self.guided.generator.set_state(noise)
+        decision = self.guided.decide(history, strength)
+        n_steps = self.guided.pair.alignment.n_steps
+        student = self.guided.pair.student_actions(history)
+        self.decisions.append(
+            DecisionRecord(
+                step=len(self.decisions) * n_steps,
+                chunks=Chunks(_first(alone.actions), _first(decision.actions), _first(student)),
+                teacher_discrepancy=float(alone.j[0]),
+                guided_discrepancy=float(decision.j[0]),
+                guidance_shift=float(decision.shift[0]),
+            )
+        )
+        return decision
+
+
+class FrameRecorder(VectorWrapper):
+    """Render the first environment before every step.
+
+    Attributes:
+        frames: of the running episode, (H, W, 3) uint8 each; a reset starts a new list.
+    """
+
+    def __init__(self, env: VectorEnv):
+        super().__init__(env)
+        self.frames: list[Array] = []
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset and render."""
+        result = self.env.reset(seed=seed, options=options)
+        self.frames = [self._render()]
+        return result
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step and, unless the episode is over, render."""
+        result = self.env.step(actions)
+        _, _, terminated, truncated, _ = result
+        if not (terminated[0] or truncated[0]):
+            self.frames.append(self._render())
+        return result
+
+    def _render(self) -> Array:
+        try:
+            rendered = self.env.render()
+        except Exception as error:
+            raise RuntimeError(
+                f"rendering failed ({error}). MuJoCo environments need an OpenGL backend: set the environment variable "
+                "MUJOCO_GL=egl (GPU or Mesa) or MUJOCO_GL=osmesa (software); or record without frames: --render=false"
+            ) from error
+        frame = rendered[0] if rendered else None
+        if not isinstance(frame, np.ndarray):
+            raise RuntimeError(
+                "the environment renders no pictures; pass --env.render_mode=rgb_array or --render=false"
+            )
+        return frame
+
+
+def _first(chunks: Tensor) -> Array:
+    return chunks[0].float().cpu().numpy()

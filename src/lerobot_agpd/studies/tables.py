@@ -1,0 +1,224 @@
+"""Rows of the tables in every report; the header is the first row."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+import numpy as np
+
+from lerobot_agpd.studies.evaluation import MEASURES
+from lerobot_agpd.studies.matrix import LABELS
+from lerobot_agpd.studies.results import (
+    CHECKPOINTS,
+    Methods,
+    Result,
+    Round,
+    RunResult,
+    counts,
+    difference,
+    pooled,
+    tally_rate,
+)
+
+Row = tuple[str, ...]
+
+RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+DISTANCES = {
+    "rms to the teacher": ("rms_to_teacher", "{:.3f}"),
+    "rms to the student": ("rms_to_student", "{:.3f}"),
+    "rms teacher to student": ("rms_teacher_to_student", "{:.3f}"),
+    "spread of the teacher": ("teacher_spread", "{:.3f}"),
+    "KL to the teacher": ("kl_to_teacher_median", "{:.2f}"),
+}
+"""Columns about the executed actions: key in a round's diagnostics, and format."""
+
+
+def markdown(rows: Iterable[Sequence[str]]) -> str:
+    """A table in markdown."""
+    header, *body = rows
+    lines = [header, ["---"] * len(header), *body]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+# ---- the report of some runs ----
+
+
+def summary_table(results: Sequence[Result]) -> list[Row]:
+    """One row per result, with 95 % intervals over its episodes."""
+    rows: list[Row] = [
+        ("", "success", "mean max reward", "N", "episodes generated / kept", "parameters", "ms per chunk")
+    ]
+    for result in results:
+        episodes = counts([result])
+        rows.append(
+            (
+                result.name,
+                str(pooled([result], "last", "success")),
+                str(pooled([result], "last", "max_reward")),
+                str(len(result.finals["last"].successes)),
+                f"{episodes['generated']} / {episodes['kept']}" if result.rounds else "-",
+                f"{result.latency.n_parameters / 1e6:.2f} M",
+                f"{result.latency.median_ms:.1f}",
+            )
+        )
+    return rows
+
+
+# ---- a comparison ----
+
+
+def results_table(methods: Methods, measure: str, n_seeds: int) -> list[Row]:
+    """What the methods achieved: the task's measure first, then the other one if it adds anything.
+
+    Args:
+        methods: a task's results.
+        measure: what the task is measured by.
+        n_seeds: training seeds that the comparison is to have.
+    """
+    others = [kind for kind in MEASURES if kind != measure and (kind == "success" or _reward_adds(methods))]
+    label = LABELS[measure]
+    header = ["", "training seeds", "gradient steps", f"{label}, last", "by seed", f"{label}, best"]
+    header += [f"{LABELS[kind]}, {which}" for kind in others for which in reversed(CHECKPOINTS)]
+    rows: list[Row] = [tuple(header)]
+    for name, runs in methods.items():
+        trained = runs[0].steps is not None
+        by_seed = [f"{pooled([result], 'last', measure).mean:.2f}" for result in runs]
+        cells = [
+            name,
+            f"{len(runs)} of {n_seeds}" if trained else "-",
+            str(runs[0].steps) if trained else "-",
+            str(pooled(runs, "last", measure)),
+            " / ".join(by_seed) if len(runs) > 1 else "-",
+            str(pooled(runs, "best", measure)) if trained else "-",
+        ]
+        for kind in others:
+            cells += [str(pooled(runs, "last", kind)), str(pooled(runs, "best", kind)) if trained else "-"]
+        rows.append(tuple(cells))
+    return rows
+
+
+def _reward_adds(methods: Methods) -> bool:
+    """Whether the max rewards of the evaluations are more than success and a constant."""
+    finals = [result.finals[which] for runs in methods.values() for result in runs for which in CHECKPOINTS]
+    constants = [np.subtract(final.max_rewards, np.asarray(final.successes, float)) for final in finals]
+    return bool(np.ptp(np.concatenate(constants)) > 1e-6)
+
+
+def difference_table(methods: Methods, references: Sequence[str], checkpoint: str, measure: str) -> list[Row]:
+    """Every method (row) minus every reference (column)."""
+    rows: list[Row] = [("", *references)]
+    for name, runs in methods.items():
+        cells = (
+            "" if other == name else difference_cell(runs, methods[other], checkpoint, measure)
+            for other in references
+        )
+        rows.append((name, *cells))
+    return rows
+
+
+def difference_cell(
+    runs: Sequence[RunResult], others: Sequence[RunResult], checkpoint: str, measure: str
+) -> str:
+    """E.g. `**+0.05 [+0.01, +0.09]**³`: bold if it excludes zero with several training seeds, their number raised."""
+    estimate = difference(runs, others, checkpoint, measure)
+    if estimate is None:
+        return "-"
+    seeds = raised(estimate.n_seeds)
+    if estimate.low == estimate.high:  # no spread at all, which few environments may show by chance
+        return f"{estimate.mean:+.2f}{seeds} (in every pair)"
+    bold = estimate.excludes_zero and estimate.n_seeds > 1
+    return f"**{estimate}**{seeds}" if bold else f"{estimate}{seeds}"
+
+
+def raised(number: int) -> str:
+    """A number of training seeds as table cells show it."""
+    return str(number).translate(RAISED)
+
+
+def cost_table(methods: Methods) -> list[Row]:
+    """Episodes, training time and size of every method."""
+    rows: list[Row] = [("", "episodes generated / successful / kept", "training time", "parameters")]
+    for name, runs in methods.items():
+        episodes = counts(runs)
+        rows.append(
+            (
+                name,
+                " / ".join(f"{value / len(runs):.0f}" for value in episodes.values())
+                if episodes["generated"]
+                else "-",
+                training_time(runs) if any(result.steps is not None for result in runs) else "-",
+                f"{runs[0].latency.n_parameters / 1e6:.2f} M",
+            )
+        )
+    return rows
+
+
+def training_time(runs: Sequence[RunResult]) -> str:
+    """Mean wall-clock per run, e.g. `310 s: teacher 20, environment 90, training 200`; the rest is training."""
+    activities = sorted({activity for result in runs for activity in result.seconds} - {"total"})
+    spent = {
+        activity: float(np.mean([result.seconds.get(activity, 0.0) for result in runs]))
+        for activity in activities
+    }
+    total = float(np.mean([result.seconds["total"] for result in runs]))
+    parts = [f"{activity} {seconds:.0f}" for activity, seconds in spent.items()]
+    if parts:
+        parts.append(f"training {max(0.0, total - sum(spent.values())):.0f}")
+    return f"{total:.0f} s" + (f": {', '.join(parts)}" if parts else "")
+
+
+# ---- collection rounds ----
+
+
+def collection_table(methods: Methods) -> list[Row]:
+    """What the rounds of every method that collected did to success, actions and states; empty without any."""
+    rounds = {name: [round_ for result in runs for round_ in result.rounds] for name, runs in methods.items()}
+    rows = [(name, *_collection_cells(entries)) for name, entries in rounds.items() if entries]
+    header = ("", "success of the strategy", "of the teacher-only part", "shift in sigmas", *DISTANCES)
+    header += ("state entropy", "state coverage", "seconds per round")
+    return [header, *rows] if rows else []
+
+
+def _collection_cells(rounds: Sequence[Round]) -> Iterator[str]:
+    for part in ("strategy", "teacher_only"):
+        rate = tally_rate([round_["tallies"][part] for round_ in rounds])
+        yield "-" if rate is None else f"{rate:.2f}"
+    yield _mean([round_["mean_guidance_shift"] for round_ in rounds], "{:.2f}")
+    diagnostics = [round_["diagnostics"] or {} for round_ in rounds]
+    for key, digits in DISTANCES.values():
+        yield _mean([(entry.get("actions") or {}).get(key) for entry in diagnostics], digits)
+    for key in ("entropy", "coverage"):
+        yield _mean([(entry.get("states") or {}).get(key) for entry in diagnostics], "{:.2f}")
+    yield _mean([sum(round_["seconds"].values()) for round_ in rounds], "{:.0f}")
+
+
+def _mean(values: Sequence[float | None], digits: str) -> str:
+    present = [value for value in values if value is not None]
+    return digits.format(np.mean(present)) if present else "-"
+
+
+def rounds_table(rounds: Sequence[Round]) -> list[Row]:
+    """One row per collection round of a run."""
+    rows: list[Row] = [
+        ("round", "strength", "strategy", "teacher only", "generated", "kept", "shift in sigmas", "seconds")
+    ]
+    for entry in rounds:
+        shift = entry["mean_guidance_shift"]
+        rows.append(
+            (
+                str(entry["round"]),
+                f"{entry['strength']:.3g}",
+                *(_passed(entry["tallies"][part]) for part in ("strategy", "teacher_only")),
+                str(entry["generated"]),
+                str(entry["kept"]),
+                "-" if shift is None else f"{shift:.2f}",
+                f"{sum(entry['seconds'].values()):.0f}",
+            )
+        )
+    return rows
+
+
+def _passed(tally: Mapping[str, int]) -> str:
+    counted = tally["generated"] - tally["solved_at_start"]
+    return f"{tally['successful']} / {counted}" if counted else "-"
