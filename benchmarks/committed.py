@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from lerobot_agpd.rollout.report import RoundReport
 from lerobot_agpd.studies.evaluation import Evaluation
 from lerobot_agpd.studies.latency import Latency
 from lerobot_agpd.studies.results import Result, RunResult
@@ -47,38 +48,28 @@ def tally(old: Mapping[str, int]) -> Json:
 
 def round_report(old: Mapping[str, Any]) -> Json:
     """The report of a collection round, without its episodes."""
-    if "tallies" in old:
+    if "total" in old:
         return dict(old)
     nothing = {"generated": 0, "trivial": 0, "successful": 0, "kept": 0}
-    environment = old["environment"]
-    if isinstance(environment, Mapping) and "type" in environment:
-        type_ = RENAMED_VALUES.get(("env.type", environment["type"]), environment["type"])
-        environment = {**environment, "type": type_}
+    diagnostics = old.get("diagnostics")
     return {
         "round": old["round"],
-        "identity": {
-            "strategy": strategy(old["strategy"]),
-            "environment": environment,
-            "teacher": old["teacher"],
-            "seed": old.get("seed"),
-        },
         "strength": old["scale"],
         "next_scale": old["next_scale"],
-        "updates": old["updates"],
-        **tally({key: old[key] for key in nothing}),
+        "step": old["updates"],
+        "total": tally({key: old[key] for key in nothing}),
+        "strategy": tally(old["guided"]),
+        "teacher_only": tally(old["unguided"]),
+        "retried": tally(old.get("retried", nothing)),
+        "student_alone": tally(old.get("student_alone", nothing)),
         "kept_frames": old["kept_frames"],
-        "tallies": {
-            "strategy": tally(old["guided"]),
-            "teacher_only": tally(old["unguided"]),
-            "retried": tally(old.get("retried", nothing)),
-            "student_alone": tally(old.get("student_alone", nothing)),
-        },
         "mean_max_reward": old["mean_max_reward"],
-        "mean_discrepancy": {"strategy": old["mean_j_guided"], "teacher_only": old["mean_j_unguided"]},
+        "mean_discrepancy": old["mean_j_guided"],
+        "mean_discrepancy_teacher_only": old["mean_j_unguided"],
         "mean_guidance_shift": old["mean_shift_in_sigmas"],
         "mean_student_steps": old.get("mean_student_steps"),
         "seconds": old["seconds"],
-        "diagnostics": old.get("diagnostics"),
+        "diagnostics": diagnostics and {"seconds": 0.0, **diagnostics},
     }
 
 
@@ -102,7 +93,7 @@ def read_report(path: Path) -> list[Result]:
             latency=Latency(**entry["latency"]),
             curve={int(step): Evaluation(**values) for step, values in entry["curve"].items()},
             rounds=[
-                round_report(round_)
+                RoundReport.from_json(round_report(round_))
                 for round_ in entry.get("rounds") or entry.get("collection", {}).get("rounds", [])
             ],
         )

@@ -23,7 +23,7 @@ import gymnasium as gym
 import numpy as np
 import zarr
 
-from lerobot_agpd.replay.files import write_array
+from lerobot_agpd.files import write_array
 from lerobot_agpd.replay.stored import camera_path, split_columns
 
 VECTORS = {"observation.state": 14, "action": 14, "next.reward": 1}

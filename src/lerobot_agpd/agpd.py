@@ -44,7 +44,7 @@ from lerobot_agpd.guidance.teacher import History
 from lerobot_agpd.guidance.teacher_student import TeacherStudent
 from lerobot_agpd.replay.demonstrations import Batch
 from lerobot_agpd.replay.replay import FRAME_INDEX
-from lerobot_agpd.rollout.report import RoundReport, log_round, round_scalars, success_rate
+from lerobot_agpd.rollout.report import RoundReport, log_round, read_reports, round_scalars, success_rate
 from lerobot_agpd.rollout.seeds import STUDENT_NOISE_STREAM
 from lerobot_agpd.rollout.strategies import (
     ChunkBatch,
@@ -195,7 +195,9 @@ class AGPD:
         before, self.progress.step = self.progress.step, self.progress.step + self.run.steps_per_update
         self.progress.seen_episodes = sorted(self.replay.seen_episodes)
         due = rounds_due(self.progress.step, self.config.collect)
-        is_last = self.run.steps is not None and self.progress.step + self.run.steps_per_update > self.run.steps
+        is_last = (
+            self.run.steps is not None and self.progress.step + self.run.steps_per_update > self.run.steps
+        )
         # None after the last step, because no student would learn from it; none twice, if a killed run has it already.
         if due > rounds_due(before, self.config.collect) and due > len(self.reports) and not is_last:
             self.collect_round()
@@ -228,7 +230,7 @@ class AGPD:
         self.student.train(was_training)
         processes.wait_for_everyone()
         self.replay.extend(self.journal.kept(number))  # T += episodes
-        self.reports.append(RoundReport.from_json(self.journal.reports()[number]))
+        self.reports.append(read_reports(self.journal.root)[number])
         self.progress.rounds = len(self.reports)
         if processes.is_main_process:
             log_round(self.reports[-1])

@@ -21,7 +21,7 @@ from lerobot_agpd.replay.normalization import Statistics
 from lerobot_agpd.replay.replay import Replay
 from lerobot_agpd.replay.teacher_chunks import TeacherChunks
 from lerobot_agpd.rollout.collector import Collector
-from lerobot_agpd.rollout.report import RoundReport
+from lerobot_agpd.rollout.report import RoundReport, read_reports
 from lerobot_agpd.run import RunInfo
 from lerobot_agpd.self_distillation import SelfTeacher
 from lerobot_agpd.student import Student, executed_steps
@@ -209,7 +209,7 @@ def _adopt_rounds(
     """Take the finished rounds into T: those of the checkpoint, and those finished after it was written."""
     if journal is None:
         return ()
-    reports = tuple(RoundReport.from_json(report) for report in journal.reports())
+    reports = tuple(read_reports(journal.root))
     if len(reports) < progress.rounds:
         raise FileNotFoundError(
             f"the checkpoint has used {progress.rounds} collection rounds, {journal.root} holds {len(reports)}; point "

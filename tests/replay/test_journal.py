@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 
 from lerobot_agpd.replay import stored as stored_module
 from lerobot_agpd.replay.episode import Episode, EpisodeRecord, EpisodeSpec
-from lerobot_agpd.replay.files import write_array
+from lerobot_agpd.files import write_array
 from lerobot_agpd.replay.journal import EpisodeJournal
 from lerobot_agpd.replay.stored import MAX_OPEN_FILES
 

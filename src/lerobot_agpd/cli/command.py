@@ -8,11 +8,12 @@ from argparse import ArgumentError
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
+from pathlib import Path
 from typing import get_type_hints
 
 import draccus
 from draccus.utils import DraccusException
-from lerobot.configs import parser
+from lerobot.configs import PreTrainedConfig, parser
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import has_method, init_logging
 
@@ -72,3 +73,14 @@ def _parse[C](config_class: type[C], args: list[str]) -> C:
     if has_method(config_class, "__get_path_fields__"):
         args = parser.filter_path_args(config_class.__get_path_fields__(), args)
     return draccus.parse(config_class=config_class, args=args)
+
+
+def checkpoint_of_policy_flag() -> PreTrainedConfig | None:
+    """The configuration of `--policy.path=<checkpoint>` with the `--policy.*` flags beside it; None without a path."""
+    path = parser.get_path_arg("policy")
+    if not path:
+        return None
+    overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
+    config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+    config.pretrained_path = Path(path)
+    return config

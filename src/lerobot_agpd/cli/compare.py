@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markdown import Markdown
 
 from lerobot_agpd.cli.command import entry_point
-from lerobot_agpd.guidance.config import require
+from lerobot_agpd.config import require
 from lerobot_agpd.studies.comparison import REPORT, Comparison, write_report
 from lerobot_agpd.studies.jobs import run_jobs
 from lerobot_agpd.studies.matrix import load_matrix

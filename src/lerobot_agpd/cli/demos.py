@@ -23,7 +23,7 @@ from scipy.stats import binomtest
 
 from lerobot_agpd.cli.command import command
 from lerobot_agpd.cli.progress import episode_bar
-from lerobot_agpd.collect.config import EVALUATION_SEEDS
+from lerobot_agpd.config import EVALUATION_SEEDS
 from lerobot_agpd.dataset_writer import DatasetWriter, flag, image, vector
 from lerobot_agpd.envs.base import SingleEnvConfig
 from lerobot_agpd.envs.demonstrations import SKILL, DemosReport, successful_episodes

@@ -4,7 +4,6 @@ import json
 import logging
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
 
 import draccus
 import torch
@@ -13,16 +12,14 @@ from lerobot.envs import EnvConfig
 from rich.console import Console
 from rich.table import Table
 
-from lerobot_agpd.cli.command import entry_point
-from lerobot_agpd.collect.config import EVALUATION_SEEDS
-from lerobot_agpd.collect.deciders.pair import PairDecider
-from lerobot_agpd.collect.strategies import make_strategy
-from lerobot_agpd.collect.witness import Witness
-from lerobot_agpd.distill.guided import Proposer
-from lerobot_agpd.distill.loading import load_pair, require_student, student_config_from_command_line
+from lerobot_agpd.agpd import make_strategy
+from lerobot_agpd.cli.command import checkpoint_of_policy_flag, entry_point
+from lerobot_agpd.config import EVALUATION_SEEDS, MixingForm, TeacherConfig, require
 from lerobot_agpd.files import write_json
-from lerobot_agpd.guidance.config import TeacherConfig
-from lerobot_agpd.guidance.teacher import Teacher
+from lerobot_agpd.loading import load_pair, require_student
+from lerobot_agpd.replay.episode import Episode
+from lerobot_agpd.rollout.diagnostics import ObservationReservoir
+from lerobot_agpd.rollout.strategies import Strategy
 from lerobot_agpd.studies.frontier import plot_frontier, plot_trajectories
 from lerobot_agpd.studies.sweep import Setting, Sweep, SweepRow, configured
 
@@ -49,7 +46,7 @@ class DiversityConfig:
     # weights of mixing
     lambdas: list[float] = field(default_factory=lambda: [0.05, 0.1, 0.2, 0.4, 0.7])
     # forms of mixing
-    forms: list[Literal["interpolate", "switch"]] = field(default_factory=lambda: ["interpolate", "switch"])
+    forms: list[MixingForm] = field(default_factory=lambda: ["interpolate", "switch"])
     # episodes per setting, from the same environment seeds
     episodes: int = 40
     # first environment seed; also seeds the noise
@@ -61,17 +58,16 @@ class DiversityConfig:
         """Read the checkpoint's configuration and check the options.
 
         Raises:
-            ValueError: if there is no checkpoint, or a number is out of range.
+            FlagError: if there is no checkpoint, or a number is out of range.
         """
-        self.policy = require_student(student_config_from_command_line() or self.policy)
-        if self.episodes < 2:
-            raise ValueError(f"--episodes must be at least 2, got {self.episodes}")
-        if any(scale <= 0 for scale in self.scales):
-            raise ValueError(f"--scales must be positive, got {self.scales}")
-        if any(not 0 < weight < 1 for weight in self.lambdas):
-            raise ValueError(f"--lambdas must lie between 0 and 1, got {self.lambdas}")
-        if len(self.axes) != 2:
-            raise ValueError(f"--axes must name two state dimensions, got {self.axes}")
+        self.policy = require_student(checkpoint_of_policy_flag() or self.policy)
+        require(self.episodes >= 2, f"--episodes must be at least 2, got {self.episodes}")
+        require(all(scale > 0 for scale in self.scales), f"--scales must be positive, got {self.scales}")
+        require(
+            all(0 < weight < 1 for weight in self.lambdas),
+            f"--lambdas must lie between 0 and 1, got {self.lambdas}",
+        )
+        require(len(self.axes) == 2, f"--axes must name two state dimensions, got {self.axes}")
 
     @classmethod
     def __get_path_fields__(cls) -> list[str]:
@@ -88,33 +84,32 @@ class DiversityConfig:
         ]
 
 
-def strategy(config: Any, proposer: Proposer, teacher: Teacher, setting: Setting, seed: int) -> PairDecider:
-    """A setting's strategy with its own source of noise."""
-    generator = torch.Generator(device=config.device).manual_seed(seed)
-    return make_strategy(configured(config, setting), proposer.pair(teacher), generator)
-
-
-def sweep_settings(config: DiversityConfig) -> tuple[list[SweepRow], dict[str, list[Any]]]:
+def sweep_settings(config: DiversityConfig) -> tuple[list[SweepRow], dict[str, list[Episode]]]:
     """Roll out and measure every setting.
 
     Returns:
         One row per setting, and the episodes of teacher, strongest guidance and student, for the picture.
     """
-    policy_config: Any = config.policy
-    proposer, teacher = load_pair(policy_config, config.teacher, config.env)
+    student_config = require_student(config.policy)
+    sampler, teacher = load_pair(student_config, config.teacher, config.env)
     seeds = range(config.seed, config.seed + config.episodes)
-    sweep = Sweep(policy_config, config.env, proposer.normaliser.stats, seeds, config.seed)
-    student = sweep.episodes(strategy(policy_config, proposer, teacher, STUDENT, config.seed), STUDENT)
+    sweep = Sweep(student_config, config.env, sampler.normalizer.stats, seeds, config.seed)
+
+    def strategy(setting: Setting) -> Strategy:
+        """A setting's strategy with its own source of noise."""
+        generator = torch.Generator(device=student_config.device or "cpu").manual_seed(config.seed)
+        return make_strategy(configured(student_config, setting), sampler.pair_with(teacher), generator)
+
+    student = sweep.episodes(strategy(STUDENT), STUDENT)
     student_states = sweep.states(student)
-    shown: dict[str, list[Any]] = {"student": student}
+    shown = {"student": student}
     rows: list[SweepRow] = []
-    history: Any = None
+    reservoir = ObservationReservoir(config.seed)  # of the first setting, the teacher's own decisions
     for setting in config.settings:
-        decider = strategy(policy_config, proposer, teacher, setting, config.seed)
-        watched = Witness(decider, max(policy_config.collect.diagnostics.observations, 1), config.seed)
-        episodes = sweep.episodes(watched if history is None else decider, setting)
-        history = history if history is not None else watched.history()  # the teacher's own decisions
-        rows.append(sweep.measure(setting, decider, episodes, history, student_states))
+        episodes = sweep.episodes(strategy(setting), setting, None if rows else reservoir)
+        history = reservoir.history()
+        assert history is not None
+        rows.append(sweep.measure(setting, strategy(setting), episodes, history, student_states))
         if setting.strategy in ("teacher", "guided"):
             shown[setting.strategy] = episodes
         logger.info("%s", json.dumps(rows[-1].to_json()))

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot.configs import PreTrainedConfig
-from lerobot.policies import PreTrainedPolicy, get_policy_class, make_pre_post_processors
+from lerobot.policies import PreTrainedPolicy, make_pre_post_processors
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
@@ -14,7 +14,7 @@ from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 from lerobot.utils.random_utils import seeded_context
 
 from lerobot_agpd.cli.command import entry_point
-from lerobot_agpd.guidance.loading import read_policy_config
+from lerobot_agpd.loading import load_policy, read_policy_config
 from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
     DiffusionTransformerConfig,
@@ -24,7 +24,7 @@ from lerobot_agpd.studies.latency import random_observations
 logger = logging.getLogger(__name__)
 
 TOLERANCE = 1e-6
-"""Largest difference between the two policies' normalised actions."""
+"""Largest difference between the two policies' normalized actions."""
 
 
 @dataclass
@@ -83,7 +83,7 @@ def _as(
 
 
 def largest_difference(policy: PreTrainedPolicy, plain: PreTrainedPolicy, batch_size: int = 8) -> float:
-    """Largest difference of the two policies' chunks at random normalised observations, from the same noise."""
+    """Largest difference of the two policies' chunks at random normalized observations, from the same noise."""
     observations = random_observations(policy, batch_size)
     chunks = []
     for each in (policy, plain):
@@ -104,13 +104,13 @@ def export(config: ExportConfig) -> PreTrainedPolicy:
     policy_config: Any = read_policy_config(config.checkpoint, "--checkpoint")
     if hasattr(policy_config, "pretrained_backbone_weights"):
         policy_config.pretrained_backbone_weights = None
-    policy = get_policy_class(policy_config.type).from_pretrained(config.checkpoint, config=policy_config)
-    plain = as_plain(policy)
-    difference = largest_difference(policy, plain)
+    loaded = load_policy(policy_config)
+    plain = as_plain(loaded.policy)
+    difference = largest_difference(loaded.policy, plain)
     if difference > TOLERANCE:
         raise RuntimeError(f"the exported policy's actions differ by {difference:.2e}")
     plain.save_pretrained(config.output)
-    for processor in make_pre_post_processors(policy_config, pretrained_path=config.checkpoint):
+    for processor in (loaded.preprocessor, loaded.postprocessor):
         processor.save_pretrained(config.output)
     logger.info(
         "%s checkpoint in %s; largest difference of actions %.1e", plain.name, config.output, difference

@@ -7,7 +7,7 @@ from pathlib import Path
 import draccus
 
 from lerobot_agpd.cli.command import command
-from lerobot_agpd.guidance.config import require
+from lerobot_agpd.config import require
 from lerobot_agpd.replay.export import merge
 
 logger = logging.getLogger(__name__)

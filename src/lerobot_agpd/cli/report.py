@@ -10,10 +10,9 @@ from rich.console import Console
 from rich.table import Table
 
 from lerobot_agpd.cli.command import entry_point
-from lerobot_agpd.collect.config import EVALUATION_SEEDS
-from lerobot_agpd.distill.state import REPLAY_FOLDER
-from lerobot_agpd.guidance.config import require
-from lerobot_agpd.replay.store import ReplayStore
+from lerobot_agpd.config import EVALUATION_SEEDS, require
+from lerobot_agpd.progress import REPLAY_FOLDER
+from lerobot_agpd.rollout.report import read_reports
 from lerobot_agpd.studies.curves import draw_report_curves
 from lerobot_agpd.studies.evaluation import Environments, Evaluator, checkpoint_config, checkpoint_steps
 from lerobot_agpd.studies.report import write_summary
@@ -90,7 +89,7 @@ def report_run(name: str, run: Path, evaluator: Evaluator, config: ReportConfig)
             curve[step] = evaluator.evaluate(path, config.curve_episodes, config.seed, n_steps)
         if curve:
             curve[last[0]] = first.finals["last"]
-    rounds = ReplayStore(run / REPLAY_FOLDER).reports()
+    rounds = read_reports(run / REPLAY_FOLDER)
     return [replace(first, curve=curve, rounds=rounds), *others]
 
 

@@ -6,7 +6,6 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -17,15 +16,14 @@ from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_proc
 from rich.console import Console
 from rich.table import Table
 
-from lerobot_agpd.cli.command import entry_point
-from lerobot_agpd.collect.config import EVALUATION_SEEDS
-from lerobot_agpd.collect.deciders.teacher import GuidedTeacher
-from lerobot_agpd.collect.rollout import Rollouts
-from lerobot_agpd.distill.loading import load_pair, require_student, student_config_from_command_line
-from lerobot_agpd.distill.state import DistillationState, replay_root
-from lerobot_agpd.guidance.config import TeacherConfig
-from lerobot_agpd.replay.episode import Episode, Ticket
-from lerobot_agpd.replay.store import ReplayStore
+from lerobot_agpd.agpd import GuidedStrategy
+from lerobot_agpd.cli.command import checkpoint_of_policy_flag, entry_point
+from lerobot_agpd.config import EVALUATION_SEEDS, StudentConfig, TeacherConfig, require
+from lerobot_agpd.loading import load_pair, require_student
+from lerobot_agpd.progress import Progress, find_replay_root
+from lerobot_agpd.replay.episode import Episode, EpisodeSpec
+from lerobot_agpd.rollout.report import read_reports
+from lerobot_agpd.rollout.rollout import Rollouts
 from lerobot_agpd.run import RunInfo
 from lerobot_agpd.studies.recording import Array, DecisionRecorder, FrameRecorder, RolloutRecord
 from lerobot_agpd.studies.rerun_log import blueprint, layout, log_rollout
@@ -67,11 +65,9 @@ class VizConfig:
         Raises:
             ValueError: if there is no checkpoint, or a number is out of range.
         """
-        self.policy = require_student(student_config_from_command_line() or self.policy)
-        if self.episodes < 1:
-            raise ValueError(f"--episodes must be at least 1, got {self.episodes}")
-        if self.scale is not None and self.scale < 0:
-            raise ValueError(f"--scale must not be negative, got {self.scale}")
+        self.policy = require_student(checkpoint_of_policy_flag() or self.policy)
+        require(self.episodes >= 1, f"--episodes must be at least 1, got {self.episodes}")
+        require(self.scale is None or self.scale >= 0, f"--scale must not be negative, got {self.scale}")
 
     @classmethod
     def __get_path_fields__(cls) -> list[str]:
@@ -82,42 +78,48 @@ class VizConfig:
 # ---- student and teacher ----
 
 
-def make_guided_teacher(config: VizConfig) -> GuidedTeacher:
+def make_guided_strategy(config: VizConfig) -> GuidedStrategy:
     """The checkpoint's teacher, guided toward its student as during collection.
 
     Raises:
-        ValueError: if teacher, student and environment do not fit together.
+        FlagError: if teacher, student and environment do not fit together.
     """
-    policy_config: Any = config.policy
-    proposer, teacher = load_pair(policy_config, config.teacher, config.env)
-    noise = torch.Generator(device=policy_config.device).manual_seed(config.seed)
-    return proposer.guided(teacher, noise)
+    student_config = require_student(config.policy)
+    sampler, teacher = load_pair(student_config, config.teacher, config.env)
+    noise = torch.Generator(device=student_config.device or "cpu").manual_seed(config.seed)
+    return GuidedStrategy(sampler.pair_with(teacher), noise, student_config.guidance)
 
 
 def guidance_scale(config: VizConfig) -> float:
     """`--scale`, else what the checkpoint's run would use in its next round, else where a run starts."""
     if config.scale is not None:
         return config.scale
-    policy_config: Any = config.policy
-    start = float(policy_config.guidance.scale)
+    student_config = require_student(config.policy)
+    start = student_config.guidance.scale
+    assert student_config.pretrained_path is not None
     try:
-        state = DistillationState.restore(policy_config, RunInfo(resume=True))
+        progress = Progress.read(student_config.pretrained_path)
     except FileNotFoundError:  # a checkpoint from the Hub, or one that never trained
         return start
-    output_dir = policy_config.pretrained_path.resolve().parents[2]
-    root = replay_root(policy_config.replay, RunInfo(output_dir=output_dir), state)
-    rounds = ReplayStore(root).rounds()[: state.rounds]
-    if len(rounds) < state.rounds:
-        logger.warning("%s holds no manifest of the checkpoint's rounds; the scale is %g", root, start)
+    reports = read_reports(_replay_root(student_config, progress))[: progress.rounds]
+    if len(reports) < progress.rounds:
+        logger.warning("the collected rounds of the checkpoint's run were not found; the scale is %g", start)
         return start
-    return float(rounds[-1].report["next_scale"]) if rounds else start
+    return reports[-1].next_scale if reports else start
+
+
+def _replay_root(student_config: StudentConfig, progress: Progress) -> Path:
+    assert progress.checkpoint is not None
+    return find_replay_root(
+        student_config, RunInfo(output_dir=progress.checkpoint.resolve().parents[2]), progress
+    )
 
 
 # ---- recording a rollout ----
 
 
 def record_rollouts(
-    config: VizConfig, guided: GuidedTeacher, scale: float
+    config: VizConfig, guided: GuidedStrategy, scale: float
 ) -> Iterator[tuple[Episode, RolloutRecord]]:
     """Play the episodes one by one."""
     tasks = make_env(config.env, n_envs=1)
@@ -125,9 +127,9 @@ def record_rollouts(
     frames = FrameRecorder(env) if config.render else None
     recorder = DecisionRecorder(guided)
     processors = make_env_pre_post_processors(config.env, config.policy)
-    tickets = [Ticket(number, config.seed + number, scale) for number in range(config.episodes)]
+    specs = [EpisodeSpec(number, config.seed + number, scale) for number in range(config.episodes)]
     try:
-        for episode in Rollouts(frames or env, processors, recorder).run(tickets):
+        for episode in Rollouts(frames or env, processors, guided, recorder).run(specs):
             pictures = frames.frames if frames is not None else []
             yield (
                 episode,
@@ -171,7 +173,7 @@ def visualize(config: VizConfig) -> Table:
     scale = guidance_scale(config)
     if scale == 0:
         logger.warning("the guidance scale is 0, so the guided teacher equals the teacher alone")
-    guided = make_guided_teacher(config)
+    guided = make_guided_strategy(config)
     table = Table("seed", "steps", "max reward", "success", "J alone", "J guided", title=f"scale {scale:g}")
     layouts = []
     config.output.parent.mkdir(parents=True, exist_ok=True)
@@ -190,11 +192,11 @@ def visualize(config: VizConfig) -> Table:
 
 
 def _row(episode: Episode, rollout: RolloutRecord) -> tuple[str, ...]:
-    success = "-" if episode.success is None else str(episode.success)
+    success = "-" if episode.is_success is None else str(episode.is_success)
     alone = np.mean([decision.teacher_discrepancy for decision in rollout.decisions])
     guided = np.mean([decision.guided_discrepancy for decision in rollout.decisions])
     return (
-        str(episode.ticket.seed),
+        str(episode.spec.seed),
         str(len(episode)),
         f"{episode.max_reward:.3f}",
         success,

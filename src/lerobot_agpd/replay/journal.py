@@ -24,8 +24,8 @@ from typing import Any
 
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
+from lerobot_agpd.files import append_line, complete_lines, read_json, write_array, write_json
 from lerobot_agpd.replay.episode import Episode, EpisodeRecord
-from lerobot_agpd.replay.files import append_line, complete_lines, read_json, write_array, write_json
 from lerobot_agpd.replay.stored import StoredEpisode, camera_path, split_columns
 
 logger = logging.getLogger(__name__)
@@ -85,7 +85,8 @@ class EpisodeJournal:
             features = demonstrations.features
             content = {"fps": demonstrations.fps, "robot_type": demonstrations.robot_type}
             content |= {"task": str(demonstrations.tasks.index[0]), "features": features}
-            write_json(self.root / HEADER, {**content, "identity": dict(identity)})
+            self.root.mkdir(parents=True, exist_ok=True)
+            write_json(self.root / HEADER, {**content, "identity": dict(identity)}, indent=2)
         if not resume:
             self._check_identity(json.loads(json.dumps(identity)))
 
@@ -119,7 +120,9 @@ class EpisodeJournal:
 
     def finish(self, round_number: int, report: Mapping[str, Any]) -> None:
         """Make a round a finished one; called by one process after all have written their episodes."""
-        write_json(self._folder(round_number) / REPORT, report)
+        folder = self._folder(round_number)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(folder / REPORT, report, indent=2)
 
     # ---- reading ----
 

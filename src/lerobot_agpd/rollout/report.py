@@ -5,11 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lerobot_agpd.replay.episode import EpisodeRecord
+from lerobot_agpd.replay.journal import EpisodeJournal
 from lerobot_agpd.rollout.diagnostics import RoundDiagnostics
 
 logger = logging.getLogger(__name__)
@@ -136,6 +138,11 @@ class RoundReport:
         measured = self.diagnostics.scalars if self.diagnostics else {}
         known = {name: value for name, value in rates.items() if value is not None}
         return {"strength": self.strength, **known, **measured}
+
+
+def read_reports(root: Path) -> list[RoundReport]:
+    """Reports of the finished rounds in a folder of collected episodes, in order."""
+    return [RoundReport.from_json(report) for report in EpisodeJournal(root).reports()]
 
 
 def round_scalars(reports: Sequence[RoundReport]) -> dict[str, float]:

@@ -9,9 +9,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_agpd.config import require
 from lerobot_agpd.files import write_text
-from lerobot_agpd.guidance.config import require
-from lerobot_agpd.replay.store import ReplayStore
+from lerobot_agpd.rollout.report import read_reports
 from lerobot_agpd.studies.curves import draw_task_curves
 from lerobot_agpd.studies.jobs import Job, Step
 from lerobot_agpd.studies.matrix import Matrix
@@ -93,7 +93,7 @@ class Comparison:
 
     def evaluate_here(self, run: Run) -> None:
         """Evaluate one run in this process."""
-        evaluate_run(self.matrix, run, ReplayStore(replay_folder(run)).reports())
+        evaluate_run(self.matrix, run, read_reports(replay_folder(run)))
 
     def describe(self, run: Run) -> str:
         """The state of a run and its commands."""

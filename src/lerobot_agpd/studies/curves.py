@@ -10,8 +10,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from lerobot_agpd.rollout.report import RoundReport, success_rate
 from lerobot_agpd.studies.matrix import LABELS
-from lerobot_agpd.studies.results import Result, Round, estimate, pooled, tally_rate
+from lerobot_agpd.studies.results import Result, estimate, pooled
 
 Runs = Mapping[str, Sequence[Result]]
 """Method to its results, one per training seed."""
@@ -89,17 +90,18 @@ def _draw_curve(
     axes.plot(steps[top], center[top], "^", color=color, markersize=9, markeredgecolor="white")
 
 
-def _draw_rounds(axes: Axes, rounds: Sequence[Round]) -> None:
+def _draw_rounds(axes: Axes, rounds: Sequence[RoundReport]) -> None:
     """Success of the strategy and of the teacher alone in every round, and the strength that was used."""
     axes.set(title="collection rounds", xlabel="round", ylim=(-0.02, 1.02), ylabel="success rate")
-    for kind, label, style in (("strategy", "strategy", "o-"), ("teacher_only", "teacher only", "s--")):
-        rates = {entry["round"]: tally_rate([entry["tallies"][kind]]) for entry in rounds}
+    for label, style in (("strategy", "o-"), ("teacher only", "s--")):
+        kind = label.replace(" ", "_")
+        rates = {report.round: success_rate([getattr(report, kind)]) for report in rounds}
         points = [(number, rate) for number, rate in rates.items() if rate is not None]
         if points:
             axes.plot(*zip(*points, strict=True), style, label=label, markersize=4)
     if rounds:
         strength = axes.twinx()
-        numbers, strengths = zip(*((entry["round"], entry["strength"]) for entry in rounds), strict=True)
+        numbers, strengths = zip(*((report.round, report.strength) for report in rounds), strict=True)
         strength.plot(numbers, strengths, "k:", linewidth=1)
         strength.set(ylabel="strength (dotted)", ylim=(0, None))
         axes.legend(loc="lower right", fontsize=8)

@@ -16,12 +16,12 @@ import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors
-from lerobot.policies import PreTrainedPolicy, get_policy_class, make_pre_post_processors
 from lerobot.scripts.lerobot_eval import eval_policy
 from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import seeded_context
 
 from lerobot_agpd.files import read_json, write_json
+from lerobot_agpd.loading import load_policy
 from lerobot_agpd.studies.latency import Latency, chunk_latency
 from lerobot_agpd.studies.provenance import digest
 from lerobot_agpd.studies.statistics import success_rate
@@ -88,14 +88,9 @@ class Checkpoint:
     """
 
     def __init__(self, path: Path | str, device: str, n_action_steps: int | None = None):
-        self.config = config = checkpoint_config(path, n_action_steps)
-        config.device = device
-        self.policy: PreTrainedPolicy = get_policy_class(config.type).from_pretrained(path, config=config)
-        self.preprocessor, self.postprocessor = make_pre_post_processors(
-            config,
-            pretrained_path=str(path),
-            preprocessor_overrides={"device_processor": {"device": device}},
-        )
+        self.config = checkpoint_config(path, n_action_steps)
+        self.config.device = device
+        self.loaded = load_policy(self.config)
 
     def evaluate(self, environments: Environments, n_episodes: int, start_seed: int) -> Evaluation:
         """Roll out episodes from consecutive seeds as `lerobot-eval` does; policies that sample are seeded, too."""
@@ -105,10 +100,10 @@ class Checkpoint:
             with torch.no_grad(), seeded_context(start_seed):
                 info = eval_policy(
                     envs,
-                    self.policy,
+                    self.loaded.policy,
                     *processors,
-                    self.preprocessor,
-                    self.postprocessor,
+                    self.loaded.preprocessor,
+                    self.loaded.postprocessor,
                     n_episodes=n_episodes,
                     start_seed=start_seed,
                 )
@@ -121,7 +116,7 @@ class Checkpoint:
 
     def latency(self) -> Latency:
         """Time one chunk at batch size 1."""
-        return chunk_latency(self.policy)
+        return chunk_latency(self.loaded.policy)
 
 
 class Evaluator:

@@ -12,10 +12,8 @@ from gymnasium.vector import VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lerobot_agpd.collect.decider import Decision
-from lerobot_agpd.collect.deciders.teacher import GuidedTeacher
-from lerobot_agpd.collect.stopwatch import Stopwatch
-from lerobot_agpd.guidance.teacher import History
+from lerobot_agpd.agpd import GuidedStrategy
+from lerobot_agpd.rollout.rollout import Decision
 
 Array = NDArray[Any]
 
@@ -95,46 +93,39 @@ class RolloutRecord:
 
 
 class DecisionRecorder:
-    """Decide as a guided teacher does, and record what the teacher alone and the student would have done.
+    """Record what the teacher alone and the student would have done at every decision of a guided rollout.
 
-    For one environment.
+    Made to be the `on_decision` of a rollout in one environment.
+
+    Args:
+        guided: the strategy that decides.
 
     Attributes:
         decisions: of the running episode; the caller takes them and clears the list.
     """
 
-    def __init__(self, guided: GuidedTeacher):
+    def __init__(self, guided: GuidedStrategy):
         self.guided = guided
         self.decisions: list[DecisionRecord] = []
 
-    @property
-    def n_obs_steps(self) -> int:
-        """The guided teacher's."""
-        return self.guided.n_obs_steps
-
-    @property
-    def stopwatch(self) -> Stopwatch:
-        """The guided teacher's."""
-        return self.guided.stopwatch
-
-    def decide(self, history: History, strength: Tensor, rolling_in: Tensor | None = None) -> Decision:
-        """The guided decision; the unguided one is drawn first, from the same noise."""
-        noise = self.guided.generator.get_state()
-        alone = self.guided.decide(history, torch.zeros_like(strength))
-        self.guided.generator.set_state(noise)
-        decision = self.guided.decide(history, strength)
-        n_steps = self.guided.pair.alignment.n_steps
-        student = self.guided.pair.student_actions(history)
+    def __call__(self, decision: Decision) -> None:
+        """Sample the teacher again, from the noise of the decision; later decisions stay as they are."""
+        generator, pair = self.guided.generator, self.guided.pair
+        noise = generator.get_state()
+        generator.set_state(decision.noise)
+        alone = self.guided.act(decision.history, torch.zeros_like(decision.strength))
+        generator.set_state(noise)
+        student = pair.student_actions(decision.history)
+        chunks = Chunks(_first(alone.actions), _first(decision.chunks.actions), _first(student))
         self.decisions.append(
             DecisionRecord(
-                step=len(self.decisions) * n_steps,
-                chunks=Chunks(_first(alone.actions), _first(decision.actions), _first(student)),
-                teacher_discrepancy=float(alone.j[0]),
-                guided_discrepancy=float(decision.j[0]),
-                guidance_shift=float(decision.shift[0]),
+                step=len(self.decisions) * pair.n_steps,
+                chunks=chunks,
+                teacher_discrepancy=float(alone.discrepancy[0]),
+                guided_discrepancy=float(decision.chunks.discrepancy[0]),
+                guidance_shift=float(decision.chunks.guidance_shift[0]),
             )
         )
-        return decision
 
 
 class FrameRecorder(VectorWrapper):

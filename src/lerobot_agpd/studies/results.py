@@ -8,15 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_agpd.rollout.report import RoundReport
 from lerobot_agpd.studies.evaluation import Evaluation
 from lerobot_agpd.studies.latency import Latency
 from lerobot_agpd.studies.runs import Run
 from lerobot_agpd.studies.statistics import Difference, Estimate, mean, paired_difference, success_rate
 
 CHECKPOINTS = ("best", "last")
-
-Round = Mapping[str, Any]
-"""JSON of a collection round's report, without its episodes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +33,7 @@ class Result:
     finals: Mapping[str, Evaluation]
     latency: Latency
     curve: Mapping[int, Evaluation] = field(default_factory=dict)
-    rounds: Sequence[Round] = ()
+    rounds: Sequence[RoundReport] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, with the intervals of the last checkpoint spelled out."""
@@ -45,7 +43,7 @@ class Result:
             "final": asdict(last),
             "latency": asdict(self.latency),
             "curve": {step: asdict(evaluation) for step, evaluation in self.curve.items()},
-            "rounds": list(self.rounds),
+            "rounds": [report.to_json() for report in self.rounds],
             "success": asdict(success_rate(last.successes)),
             "mean_max_reward": asdict(mean(last.max_rewards)),
         }
@@ -110,12 +108,7 @@ def difference(
 
 def counts(results: Iterable[Result]) -> dict[str, int]:
     """Generated, successful and kept episodes, summed over rounds and training seeds."""
-    rounds = [round_ for result in results for round_ in result.rounds]
-    return {key: sum(round_[key] for round_ in rounds) for key in ("generated", "successful", "kept")}
-
-
-def tally_rate(tallies: Iterable[Mapping[str, int]]) -> float | None:
-    """Success rate over the episodes of tallies that were not solved at the start; None if there were none."""
-    pairs = [(tally["successful"], tally["generated"] - tally["solved_at_start"]) for tally in tallies]
-    counted = sum(n for _, n in pairs)
-    return sum(successful for successful, _ in pairs) / counted if counted else None
+    totals = [report.total for result in results for report in result.rounds]
+    return {
+        count: sum(getattr(total, count) for total in totals) for count in ("generated", "successful", "kept")
+    }

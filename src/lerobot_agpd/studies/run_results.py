@@ -10,6 +10,7 @@ from typing import Any
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 
 from lerobot_agpd.files import read_json, write_json
+from lerobot_agpd.rollout.report import RoundReport
 from lerobot_agpd.studies.evaluation import (
     Environments,
     Evaluation,
@@ -21,14 +22,14 @@ from lerobot_agpd.studies.latency import Latency
 from lerobot_agpd.studies.matrix import Matrix
 from lerobot_agpd.studies.parsing import decode_environment
 from lerobot_agpd.studies.provenance import digest, provenance
-from lerobot_agpd.studies.results import CHECKPOINTS, Round, RunResult
+from lerobot_agpd.studies.results import CHECKPOINTS, RunResult
 from lerobot_agpd.studies.runs import Run, expand
 from lerobot_agpd.studies.training import progress, read_starts, train_command
 
 RESULT = "run.json"
 
 
-def evaluate_run(matrix: Matrix, run: Run, rounds: Sequence[Round]) -> None:
+def evaluate_run(matrix: Matrix, run: Run, rounds: Sequence[RoundReport]) -> None:
     """Evaluate what is missing of a finished run, or of a policy that is only evaluated, and write `run.json`.
 
     Args:
@@ -50,7 +51,7 @@ def evaluate_run(matrix: Matrix, run: Run, rounds: Sequence[Round]) -> None:
         "seed": run.seed,
         **_requested(matrix, run),
         **measured,
-        "rounds": list(rounds),
+        "rounds": [report.to_json() for report in rounds],
         "seconds": _seconds(run, rounds),
         "starts": read_starts(run),
         "evaluated_with": provenance(),
@@ -104,11 +105,11 @@ def _evaluate_training(matrix: Matrix, run: Run, evaluator: Evaluator) -> dict[s
     }
 
 
-def _seconds(run: Run, rounds: Sequence[Round]) -> dict[str, float]:
+def _seconds(run: Run, rounds: Sequence[RoundReport]) -> dict[str, float]:
     """Wall-clock seconds of a run's training, and those of its rounds by activity."""
     seconds = {"total": sum(start.get("seconds", 0.0) for start in read_starts(run))}
-    for round_ in rounds:
-        for activity, spent in round_["seconds"].items():
+    for report in rounds:
+        for activity, spent in report.seconds.items():
             seconds[activity] = seconds.get(activity, 0.0) + spent
     return seconds
 
@@ -154,7 +155,7 @@ def _result(run: Run, content: Mapping[str, Any]) -> RunResult:
         curve={int(step): _evaluation(entry) for step, entry in content["curve"].items()},
         finals={which: _evaluation(content[which]) for which in CHECKPOINTS},
         latency=Latency(**content["latency"]),
-        rounds=content["rounds"],
+        rounds=[RoundReport.from_json(entry) for entry in content["rounds"]],
         seconds=content["seconds"],
         rounds_adopted=sum(start["rounds_adopted"] for start in content["starts"]),
         commits=frozenset(_commit(entry["git"]) for entry in software),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot_agpd.guidance.config import require
+from lerobot_agpd.config import require
 from lerobot_agpd.studies.matrix import Matrix, TaskEntry, flat
 from lerobot_agpd.studies.parsing import decode_environment, parse_train_flags
 

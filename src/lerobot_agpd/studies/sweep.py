@@ -7,34 +7,42 @@ of the student's own rollouts are covered.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors
 from lerobot.utils.random_utils import seeded_context
 
-from lerobot_agpd.collect.config import VariationConfig
-from lerobot_agpd.collect.decider import Decider
-from lerobot_agpd.collect.diagnostics import action_diagnostics, state_path
-from lerobot_agpd.collect.rollout import Rollouts
-from lerobot_agpd.collect.success import SuccessFilter
-from lerobot_agpd.replay.episode import Array, Episode, Ticket
-from lerobot_agpd.replay.normalisation import Statistics
-from lerobot_agpd.studies.diversity import knn_entropy, state_coverage
+from lerobot_agpd.config import StudentConfig
+from lerobot_agpd.guidance.teacher import History
+from lerobot_agpd.replay.episode import Array, Episode, EpisodeSpec
+from lerobot_agpd.replay.normalization import Statistics
+from lerobot_agpd.rollout.diagnostics import (
+    EPSILON,
+    MAX_STATES,
+    NEIGHBOR,
+    action_diagnostics,
+    at_most,
+    state_path,
+)
+from lerobot_agpd.rollout.diversity import knn_entropy, state_coverage
+from lerobot_agpd.rollout.report import Tally, success_rate
+from lerobot_agpd.rollout.rollout import Decision, Rollouts
+from lerobot_agpd.rollout.strategies import Strategy
+from lerobot_agpd.rollout.success import classify
 
-CORE_NAMES = {"teacher": "replay"}
-"""Strategies that `collect.strategy` calls otherwise."""
+SettingName = Literal["teacher", "guided", "interpolate", "switch"]
 
 
 @dataclass(frozen=True)
 class Setting:
     """A strategy at a strength: `teacher`, `guided` (guidance scale), `interpolate` or `switch` (lambda)."""
 
-    strategy: str
+    strategy: SettingName
     strength: float = 0.0
 
 
@@ -47,7 +55,7 @@ class SweepRow:
         success: rate among the episodes that were not solved at the start.
         kept: number of kept episodes.
         actions: `action_diagnostics` at the same observations for all settings.
-        entropy: nearest-neighbour entropy of the states of all episodes, in nats, equal numbers of states for all.
+        entropy: nearest-neighbor entropy of the states of all episodes, in nats, equal numbers of states for all.
         entropy_kept: the same of the kept episodes; None, as above, for too few states.
         coverage: fraction of the student's own states with a state of a kept episode within epsilon.
     """
@@ -65,36 +73,21 @@ class SweepRow:
         return asdict(self)
 
 
-def configured(policy_config: Any, setting: Setting) -> Any:
-    """The student's configuration with one setting's strategy, without variations of guidance."""
-    config = deepcopy(policy_config)
-    mixing = setting.strategy in ("interpolate", "switch")
-    config.collect.strategy = "mixing" if mixing else CORE_NAMES.get(setting.strategy, setting.strategy)
-    config.collect.mixing.form = setting.strategy if mixing else config.collect.mixing.form
-    config.collect.variation = VariationConfig()
+def configured(student_config: StudentConfig, setting: Setting) -> StudentConfig:
+    """The student's configuration with one setting's strategy."""
+    config = deepcopy(student_config)
+    if setting.strategy in ("teacher", "guided"):
+        config.collect.strategy = setting.strategy
+    else:
+        config.collect.strategy, config.collect.mixing.form = "mixing", setting.strategy
     return config
-
-
-def roll_out(
-    env_config: EnvConfig, policy_config: Any, decider: Decider, strength: float, seeds: Sequence[int]
-) -> list[Episode]:
-    """Episodes from given environment seeds, in their order."""
-    tasks = make_env(env_config, n_envs=min(policy_config.collect.n_envs, len(seeds)))
-    processors = make_env_pre_post_processors(env_config, policy_config)
-    tickets = [Ticket(number, seed, strength) for number, seed in enumerate(seeds)]
-    try:
-        envs = next(iter(next(iter(tasks.values())).values()))
-        episodes = list(Rollouts(envs, processors, decider).run(tickets))
-    finally:
-        close_envs(tasks)
-    return sorted(episodes, key=lambda episode: episode.ticket.number)
 
 
 class Sweep:
     """Measure settings against each other: same environment seeds, same observations, same numbers of states.
 
     Args:
-        policy_config: the student's configuration; its `collect` group filters and says how much is measured.
+        student_config: the student's configuration; its `collect` group filters.
         env_config: the environment.
         stats: statistics that standardize states.
         seeds: environment seeds of every setting's episodes.
@@ -103,44 +96,59 @@ class Sweep:
 
     def __init__(
         self,
-        policy_config: Any,
+        student_config: StudentConfig,
         env_config: EnvConfig,
         stats: Statistics,
         seeds: Sequence[int],
         noise_seed: int,
     ):
-        self.policy_config, self.env_config = policy_config, env_config
+        self.student_config, self.env_config = student_config, env_config
         self.stats, self.seeds, self.noise_seed = stats, seeds, noise_seed
-        self.filter = SuccessFilter.from_config(policy_config.collect)
 
-    def episodes(self, decider: Decider, setting: Setting) -> list[Episode]:
-        """All episodes of a setting."""
-        with torch.no_grad(), seeded_context(self.noise_seed):
-            return roll_out(self.env_config, self.policy_config, decider, setting.strength, self.seeds)
+    def episodes(
+        self,
+        strategy: Strategy,
+        setting: Setting,
+        on_decision: Callable[[Decision], None] | None = None,
+    ) -> list[Episode]:
+        """All episodes of a setting, in the order of the seeds."""
+        tasks = make_env(self.env_config, n_envs=min(self.student_config.collect.n_envs, len(self.seeds)))
+        processors = make_env_pre_post_processors(self.env_config, self.student_config)
+        specs = [EpisodeSpec(number, seed, setting.strength) for number, seed in enumerate(self.seeds)]
+        try:
+            envs = next(iter(next(iter(tasks.values())).values()))
+            with torch.no_grad(), seeded_context(self.noise_seed):
+                episodes = list(Rollouts(envs, processors, strategy, on_decision).run(specs))
+        finally:
+            close_envs(tasks)
+        return sorted(episodes, key=lambda episode: episode.spec.number)
 
     def measure(
-        self, setting: Setting, decider: Any, episodes: Sequence[Episode], history: Any, student_states: Array
+        self,
+        setting: Setting,
+        strategy: Strategy,
+        episodes: Sequence[Episode],
+        history: History,
+        student_states: Array,
     ) -> SweepRow:
         """Compare one setting's episodes with the student's.
 
         Args:
             setting: the setting.
-            decider: its strategy, as a `PairDecider`.
-            episodes: its episodes.
+            strategy: of the setting.
+            episodes: of the setting.
             history: observations (B, T, ...) at which actions are compared.
             student_states: (M, D) states of the student's own rollouts, standardized.
         """
-        config = self.policy_config.collect.diagnostics
-        records = [self.filter.judge(episode) for episode in episodes]
-        counted = [record for record in records if not record.trivial]
+        records = [classify(episode, self.student_config.collect) for episode in episodes]
         kept = [episode for episode, record in zip(episodes, records, strict=True) if record.kept]
         with torch.no_grad(), seeded_context(self.noise_seed):
-            actions = action_diagnostics(decider, history, setting.strength, config.samples, self.noise_seed)
+            actions = action_diagnostics(strategy, history, setting.strength, self.noise_seed)
         kept_states = self.states(kept) if kept else None
-        radius = config.epsilon * student_states.shape[1] ** 0.5
+        radius = EPSILON * student_states.shape[1] ** 0.5
         return SweepRow(
             setting=setting,
-            success=sum(record.passed for record in counted) / max(len(counted), 1),
+            success=success_rate([Tally.of(records)]) or 0.0,
             kept=len(kept),
             actions=actions,
             entropy=self.entropy(self.states(episodes)),
@@ -149,14 +157,10 @@ class Sweep:
         )
 
     def states(self, episodes: Sequence[Episode]) -> Array:
-        """Standardised states of episodes, (N, D)."""
-        return np.concatenate([state_path(episode, self.stats) for episode in episodes])
+        """Standardized states of episodes, (N, D)."""
+        return np.concatenate([state_path(episode.observations, self.stats) for episode in episodes])
 
     def entropy(self, states: Array) -> float | None:
-        """Entropy of at most `diagnostics.states` of them, chosen at random; None if there are too few."""
-        config = self.policy_config.collect.diagnostics
-        distinct = np.unique(states, axis=0)
-        rng = np.random.default_rng(self.noise_seed)
-        if len(distinct) > config.states:
-            distinct = distinct[rng.choice(len(distinct), config.states, replace=False)]
-        return knn_entropy(distinct, config.neighbours) if len(distinct) > config.neighbours else None
+        """Entropy of at most MAX_STATES of them, chosen at random; None if there are too few."""
+        distinct = at_most(MAX_STATES, np.unique(states, axis=0), np.random.default_rng(self.noise_seed))
+        return knn_entropy(distinct, NEIGHBOR) if len(distinct) > NEIGHBOR else None

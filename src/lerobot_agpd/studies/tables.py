@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
+from lerobot_agpd.rollout.report import RoundReport, Tally, success_rate
 from lerobot_agpd.studies.evaluation import MEASURES
 from lerobot_agpd.studies.matrix import LABELS
 from lerobot_agpd.studies.results import (
     CHECKPOINTS,
     Methods,
     Result,
-    Round,
     RunResult,
     counts,
     difference,
     pooled,
-    tally_rate,
 )
 
 Row = tuple[str, ...]
@@ -180,17 +179,17 @@ def collection_table(methods: Methods) -> list[Row]:
     return [header, *rows] if rows else []
 
 
-def _collection_cells(rounds: Sequence[Round]) -> Iterator[str]:
-    for part in ("strategy", "teacher_only"):
-        rate = tally_rate([round_["tallies"][part] for round_ in rounds])
+def _collection_cells(rounds: Sequence[RoundReport]) -> Iterator[str]:
+    for tallies in ([report.strategy for report in rounds], [report.teacher_only for report in rounds]):
+        rate = success_rate(tallies)
         yield "-" if rate is None else f"{rate:.2f}"
-    yield _mean([round_["mean_guidance_shift"] for round_ in rounds], "{:.2f}")
-    diagnostics = [round_["diagnostics"] or {} for round_ in rounds]
+    yield _mean([report.mean_guidance_shift for report in rounds], "{:.2f}")
+    diagnostics = [report.diagnostics for report in rounds if report.diagnostics]
     for key, digits in DISTANCES.values():
-        yield _mean([(entry.get("actions") or {}).get(key) for entry in diagnostics], digits)
+        yield _mean([(entry.actions or {}).get(key) for entry in diagnostics], digits)
     for key in ("entropy", "coverage"):
-        yield _mean([(entry.get("states") or {}).get(key) for entry in diagnostics], "{:.2f}")
-    yield _mean([sum(round_["seconds"].values()) for round_ in rounds], "{:.0f}")
+        yield _mean([(entry.states or {}).get(key) for entry in diagnostics], "{:.2f}")
+    yield _mean([sum(report.seconds.values()) for report in rounds], "{:.0f}")
 
 
 def _mean(values: Sequence[float | None], digits: str) -> str:
@@ -198,27 +197,27 @@ def _mean(values: Sequence[float | None], digits: str) -> str:
     return digits.format(np.mean(present)) if present else "-"
 
 
-def rounds_table(rounds: Sequence[Round]) -> list[Row]:
+def rounds_table(rounds: Sequence[RoundReport]) -> list[Row]:
     """One row per collection round of a run."""
     rows: list[Row] = [
         ("round", "strength", "strategy", "teacher only", "generated", "kept", "shift in sigmas", "seconds")
     ]
-    for entry in rounds:
-        shift = entry["mean_guidance_shift"]
+    for report in rounds:
+        shift = report.mean_guidance_shift
         rows.append(
             (
-                str(entry["round"]),
-                f"{entry['strength']:.3g}",
-                *(_passed(entry["tallies"][part]) for part in ("strategy", "teacher_only")),
-                str(entry["generated"]),
-                str(entry["kept"]),
+                str(report.round),
+                f"{report.strength:.3g}",
+                *(_successes(tally) for tally in (report.strategy, report.teacher_only)),
+                str(report.total.generated),
+                str(report.total.kept),
                 "-" if shift is None else f"{shift:.2f}",
-                f"{sum(entry['seconds'].values()):.0f}",
+                f"{sum(report.seconds.values()):.0f}",
             )
         )
     return rows
 
 
-def _passed(tally: Mapping[str, int]) -> str:
-    counted = tally["generated"] - tally["solved_at_start"]
-    return f"{tally['successful']} / {counted}" if counted else "-"
+def _successes(tally: Tally) -> str:
+    counted = tally.generated - tally.solved_at_start
+    return f"{tally.successful} / {counted}" if counted else "-"

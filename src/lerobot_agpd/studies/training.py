@@ -29,8 +29,9 @@ from lerobot.utils.constants import (
     TRAINING_STEP,
 )
 
-from lerobot_agpd.distill.state import REPLAY_FOLDER, STATE_FILE
 from lerobot_agpd.files import read_json, write_json, write_text
+from lerobot_agpd.progress import REPLAY_FOLDER, STATE_FILE
+from lerobot_agpd.rollout.report import read_reports
 from lerobot_agpd.studies.provenance import inputs, provenance
 from lerobot_agpd.studies.runs import Run
 
@@ -181,7 +182,7 @@ class StartLog:
 
 def _rounds_adopted(run: Run) -> int:
     """Rounds that were finished after the last checkpoint: the resumed student meets them earlier."""
-    finished = len(list(replay_folder(run).glob("round-[0-9][0-9][0-9]")))
+    finished = len(read_reports(replay_folder(run)))
     checkpoint = last_checkpoint(run)
     state = checkpoint / PRETRAINED_MODEL_DIR / STATE_FILE if checkpoint else None
     return finished - (read_json(state)["rounds"] if state and state.is_file() else 0)
