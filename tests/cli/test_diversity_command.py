@@ -26,7 +26,7 @@ def test_sweep_measures_every_setting(monkeypatch, student, tmp_path):
     rows = json.loads((output / "sweep.json").read_text())["rows"]
     settings = [(row["setting"]["strategy"], row["setting"]["strength"]) for row in rows]
     assert settings == [
-        ("replay", 0.0),
+        ("teacher", 0.0),
         ("guided", 2.0),
         ("guided", 50.0),
         ("interpolate", 0.5),
@@ -53,7 +53,6 @@ def test_sweep_measures_every_setting(monkeypatch, student, tmp_path):
     [
         ({"scales": [0.0]}, "--scales must be positive"),
         ({"lambdas": [1.0]}, "--lambdas must lie between 0 and 1"),
-        ({"forms": ["swap"]}, r"--forms must be interpolate or switch, got \['swap'\]"),
         ({"episodes": 1}, "--episodes must be at least 2"),
         ({"axes": [0]}, "--axes must name two"),
     ],

@@ -4,7 +4,7 @@ import pytest
 from lerobot.envs.configs import PushtEnv
 from lerobot.utils.random_utils import seeded_context
 
-from lerobot_agpd.analysis.evaluation import Checkpoint, Environments
+from lerobot_agpd.studies.evaluation import Checkpoint, Environments
 
 
 def test_environments_serve_every_evaluation_as_if_new(student):

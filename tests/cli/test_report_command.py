@@ -1,6 +1,7 @@
 """`lerobot-agpd-report` on real Push-T."""
 
 import json
+import shutil
 import sys
 
 import pytest
@@ -9,9 +10,9 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import PushtEnv
 from lerobot.policies import make_pre_post_processors
 
-from lerobot_agpd.analysis.evaluation import Checkpoint, Environments
 from lerobot_agpd.cli import report as command
 from lerobot_agpd.policies.agpd_diffusion.modeling_agpd_diffusion import AGPDDiffusionPolicy
+from lerobot_agpd.studies.evaluation import Checkpoint, Environments
 
 pytest.importorskip("gym_pusht")
 
@@ -44,6 +45,7 @@ def test_one_row_per_policy_and_number_of_executed_steps(monkeypatch, tmp_path, 
         "report.json",
         "report.md",
         "curves.png",
+        "evaluations",
     }
     assert "1 step per chunk" in (tmp_path / "several" / "report.md").read_text()
 
@@ -119,10 +121,34 @@ def test_finished_evaluations_are_written_before_one_fails(monkeypatch, tmp_path
         done.append(name)
         return evaluate_policy(name, *rest)
 
-    evaluate_policy = command.evaluate_policy
-    monkeypatch.setattr(command, "evaluate_policy", second_fails)
+    evaluate_policy = command.report_policy
+    monkeypatch.setattr(command, "report_policy", second_fails)
     with pytest.raises(SystemExit, match="the second one"):
         reported(monkeypatch, tmp_path / "out", f"--policies={{a: {student}, b: {student}}}")
     assert [row["name"] for row in json.loads((tmp_path / "out" / "report.json").read_text())["methods"]] == [
         "a"
     ]
+
+
+def test_a_second_report_reuses_the_evaluations(monkeypatch, tmp_path, student):
+    policies = f"--policies={{student: {student}}}"
+    rows = reported(monkeypatch, tmp_path / "out", policies)
+
+    def refuse(self, *arguments):
+        raise AssertionError("evaluated again")
+
+    monkeypatch.setattr(Checkpoint, "evaluate", refuse)
+    again = reported(monkeypatch, tmp_path / "out", policies)
+    assert again["student"]["final"] == rows["student"]["final"]
+    with pytest.raises(AssertionError, match="evaluated again"):
+        reported(monkeypatch, tmp_path / "out", policies, "--seed=100007")
+
+
+def test_a_run_is_reported_with_its_curve(monkeypatch, tmp_path, student):
+    """A folder of lerobot-train with two checkpoints, here of the same weights."""
+    run = student.parents[2]
+    shutil.copytree(student, run / "checkpoints" / "000005" / "pretrained_model")
+    rows = reported(monkeypatch, tmp_path / "out", f"--runs={{run: {run}}}", "--curve_episodes=2")
+    curve = rows["run"]["curve"]
+    assert list(curve) == ["5", "10"] and curve["10"] == rows["run"]["final"]
+    assert curve["5"]["seeds"] == [100_000, 100_001]

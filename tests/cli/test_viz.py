@@ -45,7 +45,10 @@ def test_command_writes_recording_and_picture(monkeypatch, student, tmp_path):
     entities = {chunk.entity_path for chunk in RrdReader(output).store().stream()}
     for episode in range(2):
         root = f"/episode_{episode}"
-        wanted = {f"{root}/{name}" for name in ("J", "shift", "action", "reward", "success", "frame")}
+        wanted = {
+            f"{root}/{name}"
+            for name in ("discrepancy", "guidance_shift", "action", "reward", "success", "frame")
+        }
         wanted |= {f"{root}/observation/{name}" for name in ("state", "environment_state")}
         for name in ("teacher", "guided", "student"):
             wanted |= {f"{root}/frame/{name}", f"{root}/chunk/0/{name}", f"{root}/chunk/1/{name}"}
@@ -81,9 +84,11 @@ def test_guidance_pulls_toward_the_student_from_the_same_noise(
     np.testing.assert_array_equal(first.chunks.teacher, unguided.decisions[0].chunks.teacher)
     np.testing.assert_array_equal(first.chunks.student, unguided.decisions[0].chunks.student)
     assert np.abs(first.chunks.guided - first.chunks.teacher).max() > 0
-    assert np.isfinite(first.shift_in_sigmas)
+    assert np.isfinite(first.guidance_shift)
     if representation == "action":
-        assert all(decision.j_guided < decision.j_teacher for decision in guided.decisions)
+        assert all(
+            decision.guided_discrepancy < decision.teacher_discrepancy for decision in guided.decisions
+        )
 
 
 def test_student_chunk_is_what_the_policy_executes(monkeypatch, student):

@@ -1,4 +1,4 @@
-"""What a comparison makes of its results: differences, tables, curves."""
+"""Differences, tables, pictures and reports of known results."""
 
 from dataclasses import asdict, replace
 
@@ -8,7 +8,7 @@ import pytest
 from matrices import changed, content, evaluation, load
 from scipy.stats import t
 
-from lerobot_agpd.files import write_json
+from lerobot_agpd.files import read_json, write_json
 from lerobot_agpd.studies.comparison import Comparison, read_or_skip, write_pictures
 from lerobot_agpd.studies.curves import draw_report_curves, mean_curve
 from lerobot_agpd.studies.latency import Latency
@@ -52,15 +52,19 @@ def store(run, matrix, best, last, curve=None, rounds=(), seconds=None, adopted=
     )
 
 
-def collected(guided, unguided, actions=None, states=None) -> dict:
-    """A round's report; generated, successful and kept episodes of both parts, none of them trivial."""
+def collected(strategy, teacher_only, actions=None, states=None, number=0) -> dict:
+    """A round's report; generated, successful and kept episodes of both parts, none of them solved at the start."""
     keys = ("generated", "successful", "kept")
-    parts = [dict(zip(keys, part, strict=True)) for part in (guided, unguided)]
+    parts = [dict(zip(keys, part, strict=True)) for part in (strategy, teacher_only)]
     return {
         **{key: parts[0][key] + parts[1][key] for key in keys},
-        "guided": {"trivial": 0, **parts[0]},
-        "unguided": {"trivial": 0, **parts[1]},
-        "mean_shift_in_sigmas": 0.5,
+        "round": number,
+        "strength": 0.5,
+        "tallies": {
+            "strategy": {"solved_at_start": 0, **parts[0]},
+            "teacher_only": {"solved_at_start": 0, **parts[1]},
+        },
+        "mean_guidance_shift": 0.5,
         "diagnostics": {"actions": actions, "states": states} if actions or states else None,
         "seconds": {"teacher": 2.0, "environment": 1.0},
     }
@@ -76,7 +80,7 @@ def compared(tmp_path):
     curve = {10: [1, 1], 20: [1, 0]}
     store(runs["pusht/bc/seed-1"], matrix, [1, 0, 0, 0], [0, 0, 0, 0], curve)
     store(runs["pusht/bc/seed-2"], matrix, [1, 1, 0, 0], [1, 0, 0, 0], {10: [0, 0], 20: [1, 1]})
-    round_ = collected(guided=(6, 6, 5), unguided=(4, 2, 2))
+    round_ = collected(strategy=(6, 6, 5), teacher_only=(4, 2, 2))
     spent = {"total": 60.0, "teacher": 20.0, "environment": 10.0}
     store(runs["pusht/agpd/seed-1"], matrix, [1, 1, 1, 0], [1, 1, 0, 0], curve, [round_, round_], spent)
     store(runs["pusht/agpd/seed-2"], matrix, [1, 1, 1, 1], [1, 1, 1, 0], curve, [round_], spent, adopted=1)
@@ -89,23 +93,23 @@ def compared(tmp_path):
 
 def test_differences_are_paired_by_seed_and_environment(compared):
     _, results = compared
-    difference = compare(results["agpd"], results["bc"], "best", "success")
+    found = difference(results["agpd"], results["bc"], "best", "success")
     # differences [[0, 1, 1, 0], [0, 0, 1, 1]]: equal row means, so MS_seed = 0 is replaced by MS_rest;
     # column means 0, .5, 1, .5 about .5: MS_environment = 2 * .5 / 3 = 1/3; residuals 0, +-.5, 0, +-.5: MS_rest = 1/3
     half = t.ppf(0.975, 1) * np.sqrt(1 / 3 / 8)
-    assert difference.mean == 0.5 and difference.n_seeds == 2
-    assert (difference.low, difference.high) == pytest.approx((0.5 - half, 0.5 + half))
-    against_teacher = compare(results["agpd"], results["teacher"], "last", "success")
+    assert found.mean == 0.5 and found.n_seeds == 2
+    assert (found.low, found.high) == pytest.approx((0.5 - half, 0.5 + half))
+    against_teacher = difference(results["agpd"], results["teacher"], "last", "success")
     assert against_teacher.mean == pytest.approx((2 / 4 + 3 / 4) / 2 - 3 / 4) and against_teacher.n_seeds == 2
-    assert compare(results["teacher"], results["bc"], "last", "max_reward").mean == pytest.approx(
+    assert difference(results["teacher"], results["bc"], "last", "max_reward").mean == pytest.approx(
         0.5 * (0.75 - 0.125)
     )
-    assert compare(results["bc"][:1], results["agpd"][1:], "best", "success") is None
+    assert difference(results["bc"][:1], results["agpd"][1:], "best", "success") is None
 
 
 def test_what_a_method_reached(compared):
     _, results = compared
-    header, rows = results_table(results, "success", 3)
+    header, *rows = results_table(results, "success", 3)
     row = dict(zip(header, rows[1], strict=True))
     assert (row[""], row["training seeds"], row["gradient steps"]) == ("agpd", "2 of 3", "20")
     assert row["success rate, last"].startswith("0.62 [") and row["by seed"] == "0.50 / 0.75"
@@ -116,7 +120,7 @@ def test_what_a_method_reached(compared):
 
 def test_rewards_are_shown_where_they_add_something(compared, tmp_path):
     _, results = compared
-    header, rows = results_table(results, "max_reward", 2)
+    header, *rows = results_table(results, "max_reward", 2)
     assert header[3:] == (
         "mean max reward, last",
         "by seed",
@@ -140,12 +144,11 @@ def same_reward(final):
 
 def test_what_a_method_cost(compared):
     _, results = compared
-    row = cost_row("agpd", results["agpd"])
-    assert len(row) == len(COST_HEADER) and row[0] == "agpd"
-    assert row[1] == "15 / 12 / 10", "means per training seed"
-    assert row[2] == training_time(results["agpd"]) == "60 s: environment 10, teacher 20, training 30"
-    assert row[3:] == ("1.50 M",)
-    assert cost_row("teacher", results["teacher"])[1:3] == ("-", "-")
+    header, _, agpd, teacher = cost_table(results)
+    assert all(len(row) == len(header) for row in (agpd, teacher))
+    assert agpd[:2] == ("agpd", "15 / 12 / 10"), "means per training seed"
+    assert agpd[2:] == ("60 s: environment 10, teacher 20, training 30", "1.50 M")
+    assert teacher[1:3] == ("-", "-")
 
 
 def test_one_training_seed_is_never_bold(compared):
@@ -169,11 +172,22 @@ def test_collection_rounds_are_pooled_and_averaged(compared):
             collected((8, 2, 2), (0, 0, 0), {"rms_to_teacher": 0.3}, {"entropy": -2.0, "coverage": 0.5}),
         ],
     )
-    rows = collection_rows({"bc": results["bc"], "agpd": [run]})
+    header, *rows = collection_table({"bc": results["bc"], "agpd": [run]})
     assert rows == [
         ("agpd", "0.50", "0.50", "0.50", "0.200", "-", "-", "-", "-", "-1.50", "0.50", "3"),
-    ], "8 of 16 guided, 1 of 2 unguided; nothing of a method without rounds"
-    assert len(rows[0]) == len(HEADER)
+    ], "8 of 16 by the strategy, 1 of 2 by the teacher; nothing of a method without rounds"
+    assert len(rows[0]) == len(header)
+    assert collection_table({"bc": results["bc"]}) == []
+
+
+def test_rounds_one_by_one():
+    solved = collected((8, 2, 2), (1, 0, 0), number=1)
+    solved["tallies"]["strategy"]["solved_at_start"] = 3
+    solved["tallies"]["teacher_only"]["solved_at_start"] = 1
+    solved["mean_guidance_shift"] = None
+    _, first, second = rounds_table([collected((6, 6, 5), (4, 2, 2)), solved])
+    assert first == ("0", "0.5", "6 / 6", "2 / 4", "10", "7", "0.50", "3")
+    assert second == ("1", "0.5", "2 / 5", "-", "9", "2", "-", "3")
 
 
 @pytest.mark.parametrize(
@@ -187,17 +201,16 @@ def test_a_policy_is_evaluated_anew_if_it_or_its_environment_changed(compared, t
     teacher = next(run for run in expand(now) if run.policy)
     with pytest.raises(ValueError, match="made with other flags"):
         read_result(teacher, now)
-    config = CompareConfig(matrix=tmp_path / "matrix.yaml")
-    assert needs_work(config, now, teacher)
+    assert Comparison(tmp_path / "matrix.yaml", now).needs_work(teacher)
 
 
 def test_a_policy_is_evaluated_anew_if_its_weights_changed(compared, tmp_path):
     matrix, _ = compared
     teacher = next(run for run in expand(matrix) if run.policy)
-    config = CompareConfig(matrix=tmp_path / "matrix.yaml")
-    assert not needs_work(config, matrix, teacher)
+    comparison = Comparison(tmp_path / "matrix.yaml", matrix)
+    assert not comparison.needs_work(teacher)
     (tmp_path / "teacher" / "model.safetensors").write_bytes(b"trained again")
-    assert needs_work(config, matrix, teacher)
+    assert comparison.needs_work(teacher)
 
 
 def test_results_are_those_of_the_whole_matrix(compared):
@@ -206,14 +219,16 @@ def test_results_are_those_of_the_whole_matrix(compared):
     (first.folder / RESULT).write_text("{}")
     with pytest.raises(ValueError, match="is damaged"):
         read_results(matrix)
-    found, missing = read_results(matrix, _readable)
+    found, missing = read_results(matrix, read_or_skip)
     assert {name: len(runs) for name, runs in found["pusht"].items()} == {"bc": 1, "agpd": 2, "teacher": 1}
     assert missing == [first.name], "a damaged one is named, not fatal"
 
 
 def test_the_report_says_what_is_missing_and_what_was_disturbed(compared):
     matrix, results = compared
-    text = report(matrix, {"pusht": results}, ["pusht/dagger/seed-1", "pusht/pd/seed-1", "pusht/pd/seed-2"])
+    text = comparison_report(
+        matrix, {"pusht": results}, ["pusht/dagger/seed-1", "pusht/pd/seed-1", "pusht/pd/seed-2"]
+    )
     assert (
         "## pusht" in text and "Not finished: seed-1 of pusht/dagger; seed-1, seed-2 of pusht/pd.**" in text
     )
@@ -227,7 +242,7 @@ def test_the_report_says_if_packages_changed_on_the_way(compared):
     run = results["bc"][0].run
     store(run, matrix, [1, 0, 0, 0], [0, 0, 0, 0], {10: [1, 1], 20: [1, 0]}, torch="3")
     results["bc"][0] = read_result(run, matrix)
-    text = report(matrix, {"pusht": results}, [])
+    text = comparison_report(matrix, {"pusht": results}, [])
     assert "Not all was made with the same packages: torch 2; torch 3.**" in text
 
 
@@ -239,7 +254,7 @@ def test_the_report_names_runs_that_another_teacher_taught(compared):
             replace(result, inputs={"teacher": name})
             for result, name in zip(results["agpd"], fingerprints, strict=True)
         ]
-        return report(matrix, {"pusht": {**results, "agpd": taught}}, [])
+        return comparison_report(matrix, {"pusht": {**results, "agpd": taught}}, [])
 
     evaluated = results["teacher"][0].weights
     assert "had the same" not in text(evaluated, evaluated)
@@ -256,21 +271,23 @@ def test_the_report_names_runs_that_another_teacher_taught(compared):
 
 def test_differences_without_spread_are_not_shown_as_certain(compared):
     _, results = compared
-    rows = difference_rows({"a": results["bc"], "b": results["bc"]}, ["a", "b"], "last", "success")
-    assert rows == [("a", "", "+0.00² (in every pair)"), ("b", "+0.00² (in every pair)", "")]
+    rows = difference_table({"a": results["bc"], "b": results["bc"]}, ["a", "b"], "last", "success")
+    assert rows[1:] == [("a", "", "+0.00² (in every pair)"), ("b", "+0.00² (in every pair)", "")]
 
 
 def test_all_are_compared_with_the_references(compared, tmp_path):
     matrix, results = compared
-    text = report(load(tmp_path, content(tmp_path) | {"references": ["bc"]}), {"pusht": results}, [])
+    text = comparison_report(
+        load(tmp_path, content(tmp_path) | {"references": ["bc"]}), {"pusht": results}, []
+    )
     assert "|  | bc |" in text.splitlines()
-    assert "|  | bc | agpd | teacher |" in report(matrix, {"pusht": results}, []), "by default all"
+    assert "|  | bc | agpd | teacher |" in comparison_report(matrix, {"pusht": results}, []), "by default all"
 
 
 def test_pictures_show_every_task_and_method(compared, tmp_path):
     matrix, results = compared
     write_pictures(matrix, {"pusht": results}, tmp_path)
-    text = report(matrix, {"pusht": results}, [], "figures/")
+    text = comparison_report(matrix, {"pusht": results}, [], "figures/")
     for name in ("outcomes-pusht.png", "curves-pusht.png"):
         assert matplotlib.image.imread(tmp_path / name).std() > 0 and f"](figures/{name})" in text
 
@@ -282,12 +299,27 @@ def test_pooled_measures_treat_episodes_alike(compared):
     assert rewards.mean == 0.3125 and rewards.n == 8
 
 
-def test_curves_are_means_over_training_seeds(compared, tmp_path):
+def test_curves_are_means_over_training_seeds(compared):
     _, results = compared
     steps, values = mean_curve(results["bc"], "success")
     assert steps.tolist() == [10, 20] and values.tolist() == [[1, 0.5], [0, 1]]
-    draw_curves(results, "success", "a task", tmp_path / "curves.png")
-    assert (tmp_path / "curves.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_some_runs_side_by_side(compared, tmp_path):
+    """What lerobot-agpd-report makes of its results."""
+    _, results = compared
+    shown = [results["teacher"][0], results["agpd"][0]]
+    header, teacher, agpd = summary_table(shown)
+    row = dict(zip(header, agpd, strict=True))
+    assert row["success"] == str(success_rate([True, True, False, False])) and row["N"] == "4"
+    assert row["episodes generated / kept"] == "20 / 14" and teacher[4] == "-"
+    write_summary(shown, {"type": "pusht"}, 100_000, tmp_path)
+    entries = read_json(tmp_path / "report.json")["methods"]
+    assert [entry["final"]["successes"] for entry in entries] == [r.finals["last"].successes for r in shown]
+    assert entries[1]["success"]["mean"] == 0.5 and len(entries[1]["rounds"]) == 2
+    assert agpd[0] in (tmp_path / "report.md").read_text()
+    draw_report_curves(shown, "a title", tmp_path / "curves.png")
+    assert matplotlib.image.imread(tmp_path / "curves.png").std() > 0
 
 
 def test_a_result_is_trusted_only_if_whole_and_of_this_matrix(compared, tmp_path):
@@ -299,7 +331,7 @@ def test_a_result_is_trusted_only_if_whole_and_of_this_matrix(compared, tmp_path
     path = run.folder / RESULT
     text = path.read_text()
     path.write_text(text[: len(text) // 2])
-    with pytest.raises(ValueError, match=r"run\.json is damaged .* remove it"):
+    with pytest.raises(ValueError, match=r"run\.json is damaged"):
         read_result(run, matrix)
     path.unlink()
     assert read_result(run, matrix) is None

@@ -32,7 +32,6 @@ ROOT = Path(__file__).parents[2]
 sys.path.append(str(ROOT / "benchmarks"))
 from committed import flags as committed_flags  # noqa: E402
 
-
 # ---- the matrix ----
 
 
@@ -53,9 +52,7 @@ def test_expansion_layers_flags_and_names_folders(tmp_path):
     assert agpd.flags["policy.teacher.path"] == teacher.policy == str(tmp_path / "teacher")
     assert teacher.seed is None and teacher.flags["policy.path"] == teacher.policy
     args = bc.args
-    assert (
-        "--dataset.episodes=[0, 1]" in args and "--policy.push_to_hub=false" in args and "--seed=1" in args
-    )
+    assert "--dataset.episodes=[0, 1]" in args and "--policy.push_to_hub=false" in args and "--seed=1" in args
     check(matrix, runs)
 
 

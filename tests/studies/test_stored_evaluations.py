@@ -19,7 +19,9 @@ def test_an_evaluation_is_reused_for_the_same_request(tmp_path):
 
 @pytest.mark.parametrize("damage", ["missing episodes", "half a file", "no rewards"])
 def test_a_damaged_evaluation_is_not_reused(tmp_path, damage):
-    file = store_evaluation(tmp_path, REQUEST, evaluation([1, 0] if damage == "missing episodes" else [1, 0, 1]))
+    file = store_evaluation(
+        tmp_path, REQUEST, evaluation([1, 0] if damage == "missing episodes" else [1, 0, 1])
+    )
     if damage == "half a file":
         file.write_text(file.read_text()[:50])
     if damage == "no rewards":
