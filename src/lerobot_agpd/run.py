@@ -15,7 +15,7 @@ from typing import Any
 import draccus
 import torch
 import yaml
-from lerobot.configs import parser
+from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 from lerobot.envs import EnvConfig
 from lerobot.transforms import ImageTransforms, ImageTransformsConfig
@@ -32,6 +32,8 @@ class RunInfo:
         steps: number of training steps; None if a run that was declared did not say.
         resume: whether the run continues a checkpoint.
         image_transforms: what the loader does to training images (..., C, H, W), or None.
+        lerobot_ema: whether LeRobot averages the weights itself (`--ema.enable`).
+        sharded: whether the processes share the parameters out among them (FSDP).
     """
 
     output_dir: Path | None = None
@@ -39,6 +41,13 @@ class RunInfo:
     steps: int | None = None
     resume: bool = False
     image_transforms: Callable[[Tensor], Tensor] | None = None
+    lerobot_ema: bool = False
+    sharded: bool = False
+
+    @classmethod
+    def of(cls, config: PreTrainedConfig) -> RunInfo:
+        """Facts of the run that trains a policy of this configuration."""
+        return this_run()
 
 
 _declared: ContextVar[RunInfo | None] = ContextVar("declared_run", default=None)
@@ -69,6 +78,8 @@ def this_run() -> RunInfo:
         steps=int(steps),
         resume=resume if isinstance(resume, bool) else draccus.decode(bool, yaml.safe_load(resume)),
         image_transforms=_image_transforms(config.get("dataset")),
+        lerobot_ema=parser.parse_arg("ema.enable") == "true",
+        sharded=os.environ.get("ACCELERATE_USE_FSDP", "false").lower() == "true",
     )
 
 

@@ -30,9 +30,9 @@ from lerobot.utils.constants import ACTION
 from lerobot.utils.random_utils import seeded_context
 from torch import Tensor
 
+from lerobot_agpd.guidance.action_normalizer import ActionNormalizer
 from lerobot_agpd.guidance.config import GUIDANCE_POINTS
 from lerobot_agpd.guidance.guide import Guide
-from lerobot_agpd.guidance.units import ActionUnits
 
 Features = Mapping[str, PolicyFeature]
 
@@ -75,7 +75,7 @@ class Teacher(ABC):
                 f"the preprocessor of the {self.type} teacher has no normaliser, so its action space is unknown; "
                 f"its steps are {[type(step).__name__ for step in preprocessor.steps]}"
             )
-        self._units = ActionUnits(normalisers[0], self.action_feature.shape[0])
+        self._normalizer = ActionNormalizer(normalisers[0], self.action_feature.shape[0])
         if any(
             isinstance(step, RelativeActionsProcessorStep) and step.enabled for step in preprocessor.steps
         ):
@@ -140,8 +140,8 @@ class Teacher(ABC):
     # ---- action spaces ----
 
     def to_units(self, actions_raw: Tensor) -> Tensor:
-        """Raw actions (..., A) in the teacher's normalised space (`guidance/units.py`)."""
-        return self._units.of(actions_raw)
+        """Raw actions (..., A) in the teacher's normalised space (`guidance/action_normalizer.py`)."""
+        return self._normalizer.normalize(actions_raw)
 
     def to_raw(self, actions: Tensor) -> Tensor:
         """Actions (..., A) of the teacher's normalised space in the environment's units."""
