@@ -78,10 +78,10 @@ class AveragedWeights:
 
     def save_raw(self, folder: Path) -> None:
         """Write the raw weights beside a checkpoint's averaged ones."""
-        with self.activated(False):
+        with self.activated(False):  # while writing, too: on a CPU these are the module's own tensors
             raw = {key: value.contiguous().cpu() for key, value in self._module.state_dict().items()}
-        raw[STEPS_KEY] = torch.tensor(self._ema.optimization_step)
-        save_file(raw, folder / RAW_WEIGHTS)
+            raw[STEPS_KEY] = torch.tensor(self._ema.optimization_step)
+            save_file(raw, folder / RAW_WEIGHTS)
 
     def load_raw(self, folder: Path) -> None:
         """Continue a checkpoint whose average the module holds: read its raw weights into the module.
