@@ -83,7 +83,7 @@ def build_parts(
     """
     config, processes = student.config, PartialState()
     require(
-        not run.shards_weights,
+        not run.sharded,
         "--parallelism.*: AGPD collects with whole policies, so it cannot shard them; use DDP",
     )
     progress = Progress.restore(config, run)

@@ -25,8 +25,8 @@ class RunInfo:
         steps_per_update: of those, steps per optimizer step (gradient accumulation).
         resume: whether the run continues a checkpoint.
         image_transforms: what the loader does to training images (..., C, H, W), or None.
-        averages_weights: whether LeRobot keeps averaged weights of its own (`--ema.enable`).
-        shards_weights: whether parameters are spread over processes (`--parallelism.*`, FSDP).
+        lerobot_ema: whether LeRobot keeps averaged weights of its own (`--ema.enable`).
+        sharded: whether parameters are spread over processes (`--parallelism.*`, FSDP).
     """
 
     output_dir: Path | None = None
@@ -35,8 +35,8 @@ class RunInfo:
     steps_per_update: int = 1
     resume: bool = False
     image_transforms: Callable[[Tensor], Tensor] | None = None
-    averages_weights: bool = False
-    shards_weights: bool = False
+    lerobot_ema: bool = False
+    sharded: bool = False
 
     @classmethod
     def from_train_config(cls, config: TrainPipelineConfig) -> RunInfo:
@@ -55,8 +55,8 @@ class RunInfo:
             steps_per_update=getattr(accumulation, "steps", 1),
             resume=config.resume,
             image_transforms=ImageTransforms(transforms) if transforms.enable else None,
-            averages_weights=getattr(ema, "enable", False),
-            shards_weights=getattr(parallelism, "dp_shard", 1) not in (1, None),
+            lerobot_ema=getattr(ema, "enable", False),
+            sharded=getattr(parallelism, "dp_shard", 1) not in (1, None),
         )
 
     @classmethod

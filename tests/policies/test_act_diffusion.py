@@ -95,14 +95,11 @@ def test_the_condition_is_what_acts_decoder_would_attend_to(make_config):
     [
         ({}, 3),
         ({"images": True}, 3 + 2 * 3 * 2),
-        (
-            {"images": True, "vision_backbone": "resnet50", "replace_final_stride_with_dilation": True},
-            3 + 2 * 5 * 3,
-        ),
+        ({"images": True, "vision_backbone": "resnet50"}, 3 + 2 * 3 * 2),
     ],
 )
 def test_number_of_tokens(make_config, options, n_tokens):
-    """Latent, state, environment state, and per camera of 70 x 40 pixels a map of 3 x 2 cells (5 x 3 dilated)."""
+    """Latent, state, environment state, and per camera of 70 x 40 pixels a map of 3 x 2 cells."""
     config = make_config(**options)
     assert config.n_encoder_tokens == n_tokens
     policy = ACTDiffusionPolicy(config).train()
@@ -171,7 +168,7 @@ def test_it_teaches(make_config, demonstrations, tmp_path, at):
     assert (teacher.n_obs_steps, teacher.start, teacher.n_chunk_steps) == (1, 0, H)
 
     history = batch_for(policy.config, actions=False)
-    target = torch.full((B, H, 2), 0.5)  # in the teacher's units
+    target = torch.full((B, H, 2), 0.5)  # in the teacher's normalized space
     chunks = {}
     for scale in (None, 0.0, 50.0):
         guide = None

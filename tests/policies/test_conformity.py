@@ -31,7 +31,7 @@ TRANSFORMER = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 64, "n_encoder_
 ACT = {**TRANSFORMER, "chunk_size": 8, "n_action_steps": 4, "n_vae_encoder_layers": 1}
 SAMPLER = {"horizon": 8, "n_action_steps": 4, "num_inference_steps": 2}
 HEAD = {"transformer": TransformerDenoiserConfig(width=16, n_layers=1, n_heads=2)}
-MLP = {**SAMPLER, "denoiser": "mlp", "mlp": MLPDenoiserConfig(width=16, n_blocks=1, time_embed_dim=8)}
+MLP = {**SAMPLER, "denoiser": "mlp", "mlp": MLPDenoiserConfig(width=16, n_blocks=1)}
 UNET = {**SAMPLER, "denoiser": "unet", "down_dims": (16,)}
 FROM_LOADER = {"in_memory": False}
 
@@ -94,7 +94,7 @@ def policy(config, dataset) -> PreTrainedPolicy:
 
 @pytest.fixture
 def batch(config, policy, dataset) -> dict:
-    """Three items as the loader delivers them to this policy, not normalised."""
+    """Three items as the loader delivers them to this policy, not normalized."""
     deltas = resolve_delta_timestamps(config, dataset.meta)
     items = LeRobotDataset(dataset.repo_id, root=dataset.root, delta_timestamps=deltas)
     return default_collate([items[0], items[4], items[7]])

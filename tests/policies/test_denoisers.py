@@ -9,7 +9,7 @@ from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transfo
     MLPDenoiserConfig,
     TransformerDenoiserConfig,
 )
-from lerobot_agpd.policies.diffusion_transformer.denoisers import MLPDenoiser
+from lerobot_agpd.policies.diffusion_transformer.mlp import MLPDenoiser
 from lerobot_agpd.policies.diffusion_transformer.model import repeat_for_actions
 from lerobot_agpd.policies.diffusion_transformer.transformer import (
     TransformerDenoiser,
@@ -26,7 +26,7 @@ def transformer(condition_is_history=True, **options) -> TransformerDenoiser:
 
 
 def mlp() -> MLPDenoiser:
-    return MLPDenoiser(H, A, cond_dim=C * D, width=16, n_blocks=2, time_embed_dim=8)
+    return MLPDenoiser(H, A, C * D, MLPDenoiserConfig(width=16, n_blocks=2))
 
 
 def inputs():
@@ -46,8 +46,8 @@ def moved_steps(net, changed: str, step: int) -> list[bool]:
 
 @pytest.mark.parametrize(
     "net",
-    [mlp, transformer, lambda: transformer(causal=False), lambda: transformer(n_condition_layers=1)],
-    ids=["mlp", "causal", "bidirectional", "condition encoder"],
+    [mlp, transformer, lambda: transformer(causal=False)],
+    ids=["mlp", "causal", "bidirectional"],
 )
 def test_denoiser_sees_chunk_step_and_condition(net):
     net = net()
@@ -108,7 +108,7 @@ def test_size_of_the_original():
 
 
 def test_initial_weights():
-    net = transformer(width=64, n_heads=4, n_condition_layers=1)
+    net = transformer(width=64, n_heads=4)
     matrices = [p for name, p in net.named_parameters() if p.ndim == 2]
     assert torch.cat([p.flatten() for p in matrices]).std().item() == pytest.approx(0.02, rel=0.02)
     for name, parameter in net.named_parameters():
@@ -119,7 +119,7 @@ def test_initial_weights():
 
 
 def test_only_matrices_of_linear_and_attention_layers_decay():
-    net = transformer(n_condition_layers=1)
+    net = transformer()
     encoder = nn.Sequential(nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4), nn.Embedding(2, 4), nn.Linear(4, 4))
     decaying, others = weight_decay_groups(nn.ModuleList([net, encoder]))
     names = {id(p): n for n, p in nn.ModuleDict({"net": net, "encoder": encoder}).named_parameters()}
@@ -138,7 +138,7 @@ def test_only_matrices_of_linear_and_attention_layers_decay():
     } <= spared
 
 
-def test_frozen_parameters_are_not_optimised():
+def test_frozen_parameters_are_not_optimized():
     net = transformer()
     net.head.requires_grad_(False)
     given_ids = {id(p) for group in weight_decay_groups(net) for p in group["params"]}
@@ -171,23 +171,18 @@ def test_conditions_are_repeated_for_consecutive_actions():
 
 
 @pytest.mark.parametrize(
-    ("options", "flag"),
+    ("config", "options", "flag"),
     [
-        ({"width": 30, "n_heads": 4}, "--policy.transformer.width"),
-        ({"width": 9, "n_heads": 3}, "--policy.transformer.width"),
-        ({"n_layers": 0}, "--policy.transformer.n_layers"),
-        ({"n_heads": 0}, "--policy.transformer.n_heads"),
-        ({"dropout": 1.0}, "--policy.transformer.dropout"),
-        ({"attention_dropout": -0.1}, "--policy.transformer.attention_dropout"),
-        ({"n_condition_layers": -1}, "--policy.transformer.n_condition_layers"),
+        (TransformerDenoiserConfig, {"width": 30, "n_heads": 4}, "--policy.transformer.width .* got 30"),
+        (TransformerDenoiserConfig, {"width": 9, "n_heads": 3}, "--policy.transformer.width .* got 9"),
+        (TransformerDenoiserConfig, {"n_layers": 0}, "--policy.transformer.n_layers"),
+        (TransformerDenoiserConfig, {"n_heads": 0}, "--policy.transformer.n_heads"),
+        (TransformerDenoiserConfig, {"dropout": 1.0}, "--policy.transformer.dropout"),
+        (TransformerDenoiserConfig, {"attention_dropout": -0.1}, "--policy.transformer.attention_dropout"),
+        (MLPDenoiserConfig, {"width": 0}, "--policy.mlp.width"),
+        (MLPDenoiserConfig, {"n_blocks": 0}, "--policy.mlp.n_blocks"),
     ],
 )
-def test_wrong_sizes_are_named(options, flag):
+def test_wrong_sizes_are_named(config, options, flag):
     with pytest.raises(ValueError, match=flag):
-        TransformerDenoiserConfig(**options)
-
-
-@pytest.mark.parametrize("width", [2, 7])
-def test_a_sinusoidal_embedding_needs_pairs(width):
-    with pytest.raises(ValueError, match=r"--policy.mlp.time_embed_dim .* even"):
-        MLPDenoiserConfig(time_embed_dim=width)
+        config(**options)

@@ -1,31 +1,33 @@
-"""Averaged weights: swapped in for evaluation and saving, swapped out for training."""
+"""The diffusion policy: its averaged weights, its checkpoints, its denoisers, its data."""
 
 import json
 
+import draccus
 import pytest
 import torch
+from accelerate import PartialState
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
-from lerobot.policies import make_policy as make_lerobot_policy, make_pre_post_processors
+from lerobot.policies import PreTrainedPolicy, make_policy as make_lerobot_policy, make_pre_post_processors
 from lerobot.policies.diffusion.modeling_diffusion import DiffusionConditionalUnet1d, DiffusionPolicy
-from safetensors.torch import load_file
+from lerobot.utils.hub import HubMixin
+from safetensors.torch import load_file, save_file
 from torch.utils.data import default_collate
 
+from lerobot_agpd.policies.diffusion_transformer.averaged_weights import RAW_WEIGHTS
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
     DiffusionTransformerConfig,
-    EMAConfig,
     MLPDenoiserConfig,
     TransformerDenoiserConfig,
 )
-from lerobot_agpd.policies.diffusion_transformer.denoisers import MLPDenoiser
+from lerobot_agpd.policies.diffusion_transformer.mlp import MLPDenoiser
 from lerobot_agpd.policies.diffusion_transformer.modeling_diffusion_transformer import (
-    RAW_WEIGHTS,
     DiffusionTransformerPolicy,
 )
 from lerobot_agpd.policies.diffusion_transformer.transformer import TransformerDenoiser
-from lerobot_agpd.run import RunInfo, declared_run
+from lerobot_agpd.run import RunInfo
 
 B = 4
 DENOISERS = {
@@ -39,7 +41,7 @@ SMALL = {
     "horizon": 8,
     "n_action_steps": 4,
     "num_train_timesteps": 10,
-    "mlp": MLPDenoiserConfig(width=16, n_blocks=1, time_embed_dim=8),
+    "mlp": MLPDenoiserConfig(width=16, n_blocks=1),
     "transformer": TransformerDenoiserConfig(width=16, n_layers=1, n_heads=2, attention_dropout=0.0),
     "device": "cpu",
     "push_to_hub": False,
@@ -48,9 +50,10 @@ SMALL = {
 
 @pytest.fixture
 def make_policy(input_features, output_features):
-    def build(**options) -> DiffusionTransformerPolicy:
+    def build(run=None, **options) -> DiffusionTransformerPolicy:
         features = {"input_features": dict(input_features), "output_features": dict(output_features)}
-        return DiffusionTransformerPolicy(DiffusionTransformerConfig(**{**SMALL, **features, **options}))
+        config = DiffusionTransformerConfig(**{**SMALL, **features, **options})
+        return DiffusionTransformerPolicy(config, run=run or RunInfo())
 
     return build
 
@@ -87,21 +90,28 @@ def fit(policy, batch, n_steps):
     return after
 
 
-def averaged(after, power, max_decay):
-    """The moving average by its formula: decay 1 - (1 + n)^-power after n steps, from the first step on."""
+def resumed(folder, resume=True) -> DiffusionTransformerPolicy:
+    """The policy of a run that continues, or only starts from, a checkpoint."""
+    config = PreTrainedConfig.from_pretrained(folder)
+    config.pretrained_path = folder
+    return DiffusionTransformerPolicy.from_pretrained(folder, config=config, run=RunInfo(resume=resume))
+
+
+def averaged(after):
+    """The moving average by its formula: decay 1 - (1 + n)^-0.75 after n steps, from the first step on."""
     mean = after[0]
     for n, new in enumerate(after[1:], start=1):
-        decay = min(1 - (1 + n) ** -power, max_decay)
+        decay = 1 - (1 + n) ** -0.75
         mean = {key: decay * mean[key] + (1 - decay) * new[key] for key in new}
     return mean
 
 
 @pytest.mark.parametrize("denoiser", DENOISERS)
 def test_eval_swaps_the_average_in_and_train_swaps_it_out(make_policy, batch, denoiser):
-    policy = make_policy(ema=EMAConfig(power=0.5, max_decay=0.6), **DENOISERS[denoiser])
+    policy = make_policy(**DENOISERS[denoiser])
     after = fit(policy, batch, 6)
     policy.eval()
-    expected = averaged(after, 0.5, 0.6)
+    expected = averaged(after)
     for key, value in weights(policy).items():
         torch.testing.assert_close(value, expected[key], rtol=1e-5, atol=1e-6)
     assert not same(weights(policy), after[-1])
@@ -149,7 +159,7 @@ def test_save_writes_the_average_and_the_raw_weights(make_policy, batch, tmp_pat
 def test_without_training_or_average_no_raw_weights_are_written(make_policy, batch, tmp_path):
     make_policy().save_pretrained(tmp_path / "untrained")
     assert not (tmp_path / "untrained" / RAW_WEIGHTS).exists()
-    policy = make_policy(ema=EMAConfig(enable=False))
+    policy = make_policy(ema=False)
     raw = fit(policy, batch, 2)[-1]
     policy.eval()
     assert same(weights(policy), raw)
@@ -168,14 +178,11 @@ def test_resuming_continues_raw_weights_and_average(make_policy, batch, tmp_path
     fit(policy, batch, 3)
     policy.eval()
 
-    config = PreTrainedConfig.from_pretrained(tmp_path)
-    config.pretrained_path = tmp_path
-    resumed = DiffusionTransformerPolicy.from_pretrained(tmp_path, config=config)
+    continued = resumed(tmp_path)
     torch.manual_seed(1)
-    with declared_run(RunInfo(resume=True)):
-        fit(resumed, batch, 3)
-    resumed.eval()
-    assert same(weights(resumed), weights(policy))
+    fit(continued, batch, 3)
+    continued.eval()
+    assert same(weights(continued), weights(policy))
 
 
 def test_resuming_without_raw_weights_is_refused(make_policy, batch, tmp_path):
@@ -183,11 +190,8 @@ def test_resuming_without_raw_weights_is_refused(make_policy, batch, tmp_path):
     fit(policy, batch, 1)
     policy.save_pretrained(tmp_path)
     (tmp_path / RAW_WEIGHTS).unlink()
-    config = PreTrainedConfig.from_pretrained(tmp_path)
-    config.pretrained_path = tmp_path
-    resumed = DiffusionTransformerPolicy.from_pretrained(tmp_path, config=config)
-    with declared_run(RunInfo(resume=True)), pytest.raises(FileNotFoundError, match=RAW_WEIGHTS):
-        fit(resumed, batch, 1)
+    with pytest.raises(FileNotFoundError, match=RAW_WEIGHTS):
+        fit(resumed(tmp_path), batch, 1)
 
 
 def test_a_state_dict_given_for_saving_is_replaced_by_the_average(make_policy, batch, tmp_path):
@@ -199,14 +203,49 @@ def test_a_state_dict_given_for_saving_is_replaced_by_the_average(make_policy, b
     assert same(weights(DiffusionTransformerPolicy.from_pretrained(tmp_path)), weights(policy))
 
 
-def test_averaging_sharded_parameters_is_refused(make_policy, batch, monkeypatch):
-    monkeypatch.setenv("ACCELERATE_USE_FSDP", "true")
-    with pytest.raises(RuntimeError, match=r"FSDP.*--policy.ema.enable=false"):
-        fit(make_policy(), batch, 1)
-    fit(make_policy(ema=EMAConfig(enable=False)), batch, 1)
+@pytest.fixture
+def later_lerobot(monkeypatch):
+    """Saving as in LeRobot after 0.6.1: on every process, without `state_dict`; the base class tests the rank."""
+
+    def save_on_main_process(policy, save_directory):
+        if PartialState().is_main_process:
+            policy.config._save_pretrained(save_directory)
+            save_file(policy.state_dict(), save_directory / "model.safetensors")
+
+    monkeypatch.setattr(PreTrainedPolicy, "_save_pretrained", save_on_main_process)
+    monkeypatch.setattr(PreTrainedPolicy, "save_pretrained", HubMixin.save_pretrained)
 
 
-def test_batch_normalisation_beside_the_average_is_pointed_out(make_policy, batch, caplog):
+def test_later_versions_save_without_a_state_dict(make_policy, batch, tmp_path, later_lerobot):
+    policy = make_policy()
+    raw = fit(policy, batch, 3)[-1]
+    policy.save_pretrained(tmp_path)
+    assert same(weights(policy), raw)
+    policy.eval()
+    assert same(weights(DiffusionTransformerPolicy.from_pretrained(tmp_path)), weights(policy))
+    fit(resumed(tmp_path), batch, 1)
+
+
+def test_only_the_main_process_writes(make_policy, batch, tmp_path, later_lerobot, monkeypatch):
+    policy = make_policy()
+    raw = fit(policy, batch, 3)[-1]
+    monkeypatch.setattr(PartialState, "is_main_process", False)
+    policy.save_pretrained(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+    assert same(weights(policy), raw)
+
+
+@pytest.mark.parametrize(
+    ("run", "flag"),
+    [(RunInfo(lerobot_ema=True), "--ema.enable=true"), (RunInfo(sharded=True), r"--parallelism\.\*")],
+)
+def test_runs_that_cannot_be_averaged_are_refused(make_policy, batch, run, flag):
+    with pytest.raises(ValueError, match=rf"(?s)--policy.ema=true.*{flag}.*--policy.ema=false"):
+        make_policy(run=run)
+    fit(make_policy(run=run, ema=False), batch, 1)
+
+
+def test_batch_normalization_beside_the_average_is_pointed_out(make_policy, batch, caplog):
     policy = make_policy()
     policy.diffusion.encoder = torch.nn.BatchNorm1d(2)
     fit(policy, batch, 1)
@@ -218,12 +257,8 @@ def test_starting_from_a_checkpoint_starts_from_its_average(make_policy, batch, 
     fit(policy, batch, 3)
     policy.eval()
     policy.save_pretrained(tmp_path)
-    config = PreTrainedConfig.from_pretrained(tmp_path)
-    config.pretrained_path = tmp_path
-    started = DiffusionTransformerPolicy.from_pretrained(tmp_path, config=config)
-    started.train()
-    with declared_run(RunInfo(resume=False)):
-        started.forward(batch)
+    started = resumed(tmp_path, resume=False).train()
+    started.forward(batch)
     assert same(weights(started), weights(policy))
 
 
@@ -306,7 +341,7 @@ def test_one_observation_has_many_noise_levels_but_is_encoded_once(make_policy, 
 @pytest.mark.parametrize("n_obs_steps", [1, 2])
 @pytest.mark.parametrize("denoiser", DENOISERS)
 def test_frames_from_memory_give_the_loss_of_the_loaders_chunks(demonstrations, denoiser, n_obs_steps):
-    """The dataset's own delta frames, normalised by the processors, against rows cut from memory."""
+    """The dataset's own delta frames, normalized by the processors, against chunks cut from memory."""
     options = {**SMALL, **DENOISERS[denoiser], "n_obs_steps": n_obs_steps}
     config = DiffusionTransformerConfig(**options)
     policy = make_lerobot_policy(config, ds_meta=demonstrations.meta).train()
@@ -329,7 +364,6 @@ def test_frames_from_memory_give_the_loss_of_the_loaders_chunks(demonstrations, 
 @pytest.mark.parametrize(
     ("options", "flag"),
     [
-        ({"denoiser": "rnn"}, "--policy.denoiser"),
         ({"noise_samples_per_frame": 0}, "--policy.noise_samples_per_frame"),
         ({"n_action_steps": 8}, "--policy.n_action_steps=8"),
     ],
@@ -345,18 +379,14 @@ def test_a_policy_without_a_state_is_refused(make_policy, input_features):
         make_policy(input_features=without)
 
 
-def test_wrong_group_flags_are_named():
-    for build, flag in (
-        (lambda: MLPDenoiserConfig(width=0), "--policy.mlp.width"),
-        (lambda: EMAConfig(power=0), "--policy.ema.power"),
-        (lambda: EMAConfig(max_decay=1), "--policy.ema.max_decay"),
-    ):
-        with pytest.raises(ValueError, match=flag):
-            build()
+@pytest.mark.parametrize(("flag", "value"), [("denoiser", "rnn"), ("prediction_type", "v_prediction")])
+def test_unknown_choices_are_named(flag, value):
+    with pytest.raises(draccus.ParsingError, match=f"(?s){flag}.*{value}"):
+        draccus.decode(PreTrainedConfig, {"type": "diffusion_transformer", flag: value})
 
 
 def test_config_round_trip(make_policy, tmp_path):
-    config = make_policy(ema=EMAConfig(power=0.6), in_memory=False).config
+    config = make_policy(ema=False, in_memory=False).config
     config.save_pretrained(tmp_path)
     assert json.loads((tmp_path / "config.json").read_text())["type"] == "diffusion_transformer"
     loaded = PreTrainedConfig.from_pretrained(tmp_path)
@@ -365,8 +395,8 @@ def test_config_round_trip(make_policy, tmp_path):
 
 
 @pytest.mark.parametrize("in_memory", [True, False])
-def test_what_the_loader_is_asked_for(make_policy, in_memory):
+def test_what_the_loader_delivers(make_policy, in_memory):
     config = make_policy(in_memory=in_memory).config
-    assert config.chunk_offsets == list(range(-1, 7))
-    asked = (config.action_delta_indices, config.observation_delta_indices)
-    assert asked == ((None, None) if in_memory else (list(range(-1, 7)), [-1, 0]))
+    assert config.chunk_delta_indices == list(range(-1, 7))
+    requested = (config.action_delta_indices, config.observation_delta_indices)
+    assert requested == ((None, None) if in_memory else (list(range(-1, 7)), [-1, 0]))

@@ -1,13 +1,14 @@
-"""A teacher's normalized action space: where its denoising happens, and J compares chunks."""
+"""A teacher's normalized action space: where it denoises, and J compares chunks."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import cast
 
 import torch
 from lerobot.configs import FeatureType, NormalizationMode
 from lerobot.lerobot_types import TransitionKey
 from lerobot.processor import NormalizerProcessorStep
+from lerobot.processor.converters import create_transition
 from torch import Tensor
 
 LEAST_UNIT = 1e-6
@@ -15,31 +16,31 @@ LEAST_UNIT = 1e-6
 
 
 class ActionNormalizer:
-    """Raw actions in the units of a checkpoint's normalizer.
+    """Maps raw actions to the normalized space of a checkpoint.
 
-    A dimension that never varied in the teacher's data (an unused gripper) is the constant it has there, whatever it
-    is given: LeRobot divides it by 1e-8, so a student's rounding error would outweigh all other dimensions in J.
+    A dimension that never varied in the teacher's data (an unused gripper) always gets the value it has there:
+    LeRobot divides it by 1e-8, so a student's rounding error would outweigh all other dimensions in J.
 
     Args:
-        normalizer: of the checkpoint's preprocessor.
+        step: the normalizer of the checkpoint's preprocessor.
         action_dim: dimensions A of an action.
     """
 
-    def __init__(self, normalizer: NormalizerProcessorStep, action_dim: int):
-        self._normalizer = normalizer
+    def __init__(self, step: NormalizerProcessorStep, action_dim: int):
+        self._step = step
         self._ends = torch.tensor([[0.0], [1.0]]).expand(2, action_dim)
         self._varies: Tensor | None = None
-        mode = normalizer.norm_map.get(FeatureType.ACTION)
-        self._constant = (
-            0.0 if mode == NormalizationMode.MEAN_STD else -1.0
-        )  # what LeRobot makes of the only value
+        # LeRobot maps the only value of a constant dimension to 0 (its mean) or -1 (its minimum).
+        mode = step.norm_map.get(FeatureType.ACTION)
+        self._constant = 0.0 if mode == NormalizationMode.MEAN_STD else -1.0
 
     def normalize(self, actions_raw: Tensor) -> Tensor:
-        """Raw actions (..., A) in the normalized space."""
+        """Map raw actions (..., A) to the normalized space."""
         if self._varies is None or self._varies.device != actions_raw.device:
-            low, high = self._normalized(self._ends.to(actions_raw))
+            low, high = self._apply(self._ends.to(actions_raw))
             self._varies = (high - low).abs() < 1 / LEAST_UNIT  # (A,)
-        return self._normalized(actions_raw).where(self._varies, self._constant)
+        return self._apply(actions_raw).where(self._varies, self._constant)
 
-    def _normalized(self, actions_raw: Tensor) -> Any:
-        return self._normalizer({TransitionKey.ACTION: actions_raw})[TransitionKey.ACTION]
+    def _apply(self, actions_raw: Tensor) -> Tensor:
+        transition = dict(self._step(create_transition(action=actions_raw)))
+        return cast(Tensor, transition[TransitionKey.ACTION])

@@ -1,6 +1,6 @@
-"""Adapters: how the families of LeRobot policies are sampled, and which adapter serves which policy.
+"""Adapters: how each family of LeRobot policies is sampled, and which adapter belongs to which policy.
 
-Adapters are imported when a policy needs them, so that pi0 or smolvla cost nothing unless they teach.
+An adapter is imported with the first policy that needs it, so that pi0 or smolvla cost nothing unless they teach.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _ANY_OTHER = "lerobot_agpd.guidance.adapters.chunk:ChunkTeacher"
 
 
 def register_teacher(policy_type: str) -> Callable[[type[Teacher]], type[Teacher]]:
-    """Class decorator: teachers of this policy type, and of its subclasses, are sampled by the decorated adapter.
+    """Register the decorated adapter for teachers of a policy type and of the types derived from it.
 
     Args:
         policy_type: the `name` of a LeRobot policy class, which is also its `--policy.type`.
@@ -39,7 +39,7 @@ def register_teacher(policy_type: str) -> Callable[[type[Teacher]], type[Teacher
 
 
 def adapter_of(policy_class: type[PreTrainedPolicy]) -> type[Teacher]:
-    """The adapter of a policy class: that of the nearest base class with one, imported only now."""
+    """Import and return the adapter of a policy class: that of the nearest base class which has one."""
     names = [vars(base).get("name") for base in policy_class.__mro__]
     adapter = next((_ADAPTERS[name] for name in names if name in _ADAPTERS), _ANY_OTHER)
     return pkgutil.resolve_name(adapter) if isinstance(adapter, str) else adapter
@@ -50,5 +50,5 @@ def as_teacher(
     preprocessor: PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     postprocessor: PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ) -> Teacher:
-    """A policy and its processors as a teacher; neither is copied nor changed."""
+    """Wrap a policy and its processors as a teacher; they are neither copied nor changed."""
     return adapter_of(type(policy))(policy, preprocessor, postprocessor)

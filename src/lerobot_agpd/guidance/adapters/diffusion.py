@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
+from lerobot.configs import PreTrainedConfig
 from lerobot.utils.constants import OBS_IMAGES
 from torch import Tensor
 
+from lerobot_agpd.config import require
 from lerobot_agpd.guidance.guide import Guide, guided
 from lerobot_agpd.guidance.teacher import Teacher
 
-SCHEDULER_CLASSES = {"DDPM": DDPMScheduler, "DDIM": DDIMScheduler}
+if TYPE_CHECKING:
+    from lerobot.policies.diffusion.modeling_diffusion import DiffusionModel
+    from lerobot.policies.multi_task_dit.modeling_multi_task_dit import DiffusionObjective
+
+SCHEDULER_CLASSES: dict[str, type[DDPMScheduler] | type[DDIMScheduler]] = {
+    "DDPM": DDPMScheduler,
+    "DDIM": DDIMScheduler,
+}
 
 
 class DiffusionTeacher(Teacher):
@@ -44,7 +53,7 @@ class DiffusionTeacher(Teacher):
         set_diffusion_sampler(self.policy.diffusion, num_inference_steps, noise_scheduler)
 
     def _sample_chunk(
-        self, batch: dict[str, Any], guide: Guide | None, generator: torch.Generator | None
+        self, batch: dict[str, Tensor], guide: Guide | None, generator: torch.Generator | None
     ) -> Tensor:
         model = self.policy.diffusion
         condition = model._prepare_global_conditioning(stack_cameras(self.policy.config, batch))  # (B, C)
@@ -52,26 +61,28 @@ class DiffusionTeacher(Teacher):
             return model.conditional_sample(len(condition), global_cond=condition, generator=generator)
 
 
-def stack_cameras(config: Any, batch: dict[str, Any]) -> dict[str, Any]:
-    """The batch with its cameras as one tensor, (B, T, cameras, C, H, W), as LeRobot's encoders want them."""
+def stack_cameras(config: PreTrainedConfig, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Add the cameras of a batch as one tensor, (B, T, cameras, C, H, W), as LeRobot's encoders read them."""
     cameras = list(config.image_features)
     return {**batch, OBS_IMAGES: torch.stack([batch[key] for key in cameras], dim=-4)} if cameras else batch
 
 
-def set_diffusion_sampler(model: Any, num_inference_steps: int | None, noise_scheduler: str | None) -> None:
-    """Exchange the scheduler of a model with LeRobot's `noise_scheduler` and `num_inference_steps`.
+def set_diffusion_sampler(
+    model: DiffusionModel | DiffusionObjective, num_inference_steps: int | None, noise_scheduler: str | None
+) -> None:
+    """Exchange the noise scheduler of a model, and the number of its steps; None keeps either.
 
     Raises:
-        ValueError: if more steps are asked for than the model was trained with.
+        ValueError: if there are more steps than the model was trained with.
     """
     if noise_scheduler is not None:
         model.noise_scheduler = SCHEDULER_CLASSES[noise_scheduler].from_config(model.noise_scheduler.config)
     if num_inference_steps is None:
         return
-    limit = model.noise_scheduler.config.num_train_timesteps
-    if num_inference_steps > limit:
-        raise ValueError(
-            f"--policy.teacher.num_inference_steps={num_inference_steps} exceeds the {limit} "
-            "diffusion steps the teacher was trained with"
-        )
+    limit = model.noise_scheduler.config["num_train_timesteps"]
+    require(
+        num_inference_steps <= limit,
+        f"--policy.teacher.num_inference_steps={num_inference_steps} exceeds the {limit} "
+        "diffusion steps the teacher was trained with",
+    )
     model.num_inference_steps = num_inference_steps

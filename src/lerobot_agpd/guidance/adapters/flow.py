@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 
-from lerobot_agpd.guidance.adapters.diffusion import (
-    DiffusionTeacher,
-    set_diffusion_sampler,
-    stack_cameras,
-)
+from lerobot_agpd.config import GuidancePoint
+from lerobot_agpd.guidance.adapters.diffusion import DiffusionTeacher, set_diffusion_sampler, stack_cameras
 from lerobot_agpd.guidance.flow import guided_velocity
 from lerobot_agpd.guidance.guide import Guide, guided
 from lerobot_agpd.guidance.teacher import seeded_by
@@ -30,7 +25,7 @@ class MultiTaskDiTTeacher(DiffusionTeacher):
         return self.policy.config.image_resize_shape is not None
 
     @property
-    def guidance_points(self) -> tuple[str, ...]:
+    def guidance_points(self) -> tuple[GuidancePoint, ...]:
         """Where J can be differentiated: a flow has no posterior mean."""
         return ("x0",) if self.policy.config.is_flow_matching else ("x0", "mu")
 
@@ -45,7 +40,7 @@ class MultiTaskDiTTeacher(DiffusionTeacher):
             self.policy.config.num_integration_steps = num_inference_steps
 
     def _sample_chunk(
-        self, batch: dict[str, Any], guide: Guide | None, generator: torch.Generator | None
+        self, batch: dict[str, Tensor], guide: Guide | None, generator: torch.Generator | None
     ) -> Tensor:
         policy = self.policy
         condition = policy.observation_encoder.encode(stack_cameras(policy.config, batch))  # (B, C)
@@ -65,7 +60,7 @@ class GuidedVelocity(nn.Module):
         self.model = model
         self.guide = guide
 
-    def forward(self, x: Tensor, time: Tensor, **condition: Any) -> Tensor:
-        """The guided velocity, (B, H, A), of chunks (B, H, A) at times (B,), all the same."""
-        velocity = self.model(x, time, **condition)
-        return guided_velocity(self.guide, x, velocity, float(time[0]), action_dim=x.shape[-1])
+    def forward(self, x_tau: Tensor, time: Tensor, **condition: Tensor) -> Tensor:
+        """Predict the guided velocity, (B, H, A), of chunks (B, H, A) at times (B,), which are all the same."""
+        velocity = self.model(x_tau, time, **condition)
+        return guided_velocity(self.guide, x_tau, velocity, float(time[0]), x_tau.shape[-1])

@@ -1,7 +1,7 @@
 """Flow-matching policies with LeRobot's real-time-chunking (RTC) hook as teachers: pi0, pi05, smolvla.
 
 RTC pulls a chunk toward what is left of the previous one (arXiv:2506.07339); the same hook pulls it toward the
-student. LeRobot's `euler_integrate` asks the policy's RTC processor for every velocity, with time running from
+student. LeRobot's `euler_integrate` calls the policy's RTC processor for every velocity, with time running from
 1 (noise) to 0 (data) and velocities pointing from data to noise.
 """
 
@@ -15,15 +15,17 @@ import torch
 from lerobot.policies.rtc import RTCConfig
 from torch import Tensor
 
+from lerobot_agpd.config import GuidancePoint, require
 from lerobot_agpd.guidance.flow import guided_velocity
 from lerobot_agpd.guidance.guide import Guide
 from lerobot_agpd.guidance.teacher import Features, Teacher
 
-EMPTY_CAMERA = "empty_camera"  # LeRobot's name for cameras that the policy fills in by itself
+EMPTY_CAMERA = "empty_camera"
+"""Part of LeRobot's name for cameras that the policy fills in by itself."""
 
 
 class RTCTeacher(Teacher):
-    """A policy whose `predict_action_chunk` takes `noise` and whose `model` asks an RTC processor for velocities.
+    """A policy whose `predict_action_chunk` takes `noise` and whose `model` calls an RTC processor for velocities.
 
     Actions are padded to max_action_dim inside; the padding stays unguided.
     """
@@ -33,15 +35,14 @@ class RTCTeacher(Teacher):
     def __init__(self, *args: Any):
         """Refuse variants that the hook cannot guide."""
         super().__init__(*args)
-        for flag, why in (
-            (
-                "adapt_to_pi_aloha",
-                "converts actions behind the normalised space in which chunks are compared",
-            ),
+        for flag, consequence in (
+            ("adapt_to_pi_aloha", "converts actions outside the space in which chunks are compared"),
             ("compile_model", "samples in a compiled graph, which a guide cannot enter"),
         ):
-            if getattr(self.policy.config, flag, False):
-                raise ValueError(f"the {self.type} teacher has {flag}=true, so it {why}; it must be false")
+            require(
+                not getattr(self.policy.config, flag, False),
+                f"the {self.type} teacher has {flag}=true, so it {consequence}; it must be false",
+            )
 
     @property
     def n_chunk_steps(self) -> int:
@@ -60,7 +61,7 @@ class RTCTeacher(Teacher):
         return True
 
     @property
-    def guidance_points(self) -> tuple[str, ...]:
+    def guidance_points(self) -> tuple[GuidancePoint, ...]:
         """Where J can be differentiated: a flow has no posterior mean."""
         return ("x0",)
 
@@ -74,7 +75,7 @@ class RTCTeacher(Teacher):
             setattr(config, field, num_inference_steps)
 
     def _sample_chunk(
-        self, batch: dict[str, Any], guide: Guide | None, generator: torch.Generator | None
+        self, batch: dict[str, Tensor], guide: Guide | None, generator: torch.Generator | None
     ) -> Tensor:
         now = self._now(batch)
         noise = self._noise(len(next(iter(now.values()))), generator)
@@ -89,10 +90,14 @@ class RTCTeacher(Teacher):
 
 
 class VelocityGuide:
-    """What LeRobot's `euler_integrate` takes for an RTC processor, guiding toward the student."""
+    """An RTC processor for LeRobot's `euler_integrate` that guides toward the student's chunk.
+
+    Args:
+        guide: J, scales and trust region.
+        action_dim: dimensions of the padded actions that are guided, the first ones.
+    """
 
     def __init__(self, guide: Guide, action_dim: int):
-        """Guide the first `action_dim` dimensions of the padded actions."""
         self.guide = guide
         self.action_dim = action_dim
 
@@ -105,16 +110,16 @@ class VelocityGuide:
         original_denoise_step_partial: Callable[[Tensor], Tensor],
         execution_horizon: int | None = None,
     ) -> Tensor:
-        """The guided velocity from data to noise, (B, H, D); the real-time arguments are not used."""
-        velocity = -original_denoise_step_partial(x_t)  # toward the data
-        return -guided_velocity(self.guide, x_t, velocity, 1 - time, self.action_dim)
+        """Predict the guided velocity from data to noise, (B, H, D); the real-time arguments are not used."""
+        velocity_to_data = -original_denoise_step_partial(x_t)
+        return -guided_velocity(self.guide, x_t, velocity_to_data, 1 - time, self.action_dim)
 
     def is_debug_enabled(self) -> bool:
-        """Nothing is tracked."""
+        """Tell LeRobot not to track anything."""
         return False
 
     def track(self, **values: Any) -> None:
-        """Nothing is tracked; `Guide.callback` looks inside."""
+        """Do nothing; `Guide.callback` gets the steps."""
 
 
 @contextmanager

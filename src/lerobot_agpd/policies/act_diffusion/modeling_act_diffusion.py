@@ -11,16 +11,17 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_agpd.policies.act_diffusion.configuration_act_diffusion import ACTDiffusionConfig
-from lerobot_agpd.policies.diffusion_transformer.model import compiled, repeat_for_actions
+from lerobot_agpd.policies.diffusion_transformer.model import repeat_for_actions, set_denoiser
 from lerobot_agpd.policies.diffusion_transformer.modeling_diffusion_transformer import (
     DiffusionTransformerPolicy,
 )
 from lerobot_agpd.policies.diffusion_transformer.transformer import TransformerDenoiser
 from lerobot_agpd.replay.normalization import Statistics
+from lerobot_agpd.run import RunInfo
 
 
 class EncoderTokens(nn.Module):
-    """Stands in for ACT's decoder: hands through the encoder's tokens with their positions."""
+    """Replacement of ACT's decoder that returns the encoder's tokens with their positions added."""
 
     def forward(
         self, x: Tensor, encoder_out: Tensor, decoder_pos_embed: Tensor, encoder_pos_embed: Tensor
@@ -30,11 +31,11 @@ class EncoderTokens(nn.Module):
 
 
 def make_act_encoder(config: ACTDiffusionConfig) -> ACT:
-    """LeRobot's ACT whose "actions" are its encoder's tokens, (B, n_encoder_tokens, dim_model)."""
+    """Build LeRobot's ACT with its encoder's tokens, (B, n_encoder_tokens, dim_model), in place of actions."""
     act = ACT(config.act_config())
-    act.decoder = EncoderTokens()
-    act.action_head = nn.Identity()
-    act.decoder_pos_embed.requires_grad_(False)  # nothing reads it
+    act.register_module("decoder", EncoderTokens())
+    act.register_module("action_head", nn.Identity())
+    act.decoder_pos_embed.requires_grad_(False)  # unused
     return act
 
 
@@ -42,25 +43,27 @@ class ACTDiffusionModel(DiffusionModel):
     """LeRobot's sampling loop and loss around a transformer that attends to ACT's encoder tokens."""
 
     def __init__(self, config: ACTDiffusionConfig):
-        vectors = {k: ft for k, ft in config.input_features.items() if ft.type is not FeatureType.VISUAL}
-        without_images: Any = copy(config)
-        without_images.input_features = vectors
+        features = config.input_features or {}
+        without_images = copy(config)
+        without_images.input_features = {
+            key: feature for key, feature in features.items() if feature.type is not FeatureType.VISUAL
+        }
         super().__init__(without_images)  # no image encoder of its own: ACT's reads the images
         self.config = config
         self.act = make_act_encoder(config)
         head = TransformerDenoiser(
             horizon=config.horizon,
-            action_dim=config.action_feature.shape[0],
+            action_dim=config.action_dim,
             n_condition_tokens=config.n_encoder_tokens,
             condition_dim=config.dim_model,
             config=config.transformer,
             condition_is_history=False,
         )
-        self.unet = compiled(head, config)
+        set_denoiser(self, head, config)
 
     def _prepare_global_conditioning(self, batch: dict[str, Tensor]) -> Tensor:
         """Encode the current observation, (B, 1, ...) per feature, to (B, n_encoder_tokens * dim_model)."""
-        observation: dict[str, Any] = {OBS_STATE: batch[OBS_STATE][:, 0]}
+        observation: dict[str, Tensor | list[Tensor]] = {OBS_STATE: batch[OBS_STATE][:, 0]}
         if self.config.env_state_feature is not None:
             observation[OBS_ENV_STATE] = batch[OBS_ENV_STATE][:, 0]
         if self.config.image_features:
@@ -81,7 +84,8 @@ class ACTDiffusionPolicy(DiffusionTransformerPolicy):
         config: ACTDiffusionConfig,
         dataset_stats: Statistics | None = None,
         dataset_meta: LeRobotDatasetMetadata | None = None,
+        run: RunInfo | None = None,
         **kwargs: Any,
     ):
         """Build the policy; with `dataset_meta` its frames are loaded into memory at the first training step."""
-        super().__init__(config, dataset_stats, dataset_meta, **kwargs)
+        super().__init__(config, dataset_stats, dataset_meta, run, **kwargs)

@@ -19,6 +19,6 @@ def make_diffusion_transformer_pre_post_processors(
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
-    """LeRobot's diffusion processors, with statistics that no constant feature can blow up."""
+    """LeRobot's diffusion processors, with statistics whose spread has a lower limit."""
     floored = floor_statistics(dataset_stats) if dataset_stats is not None else None
     return make_diffusion_pre_post_processors(config, floored)

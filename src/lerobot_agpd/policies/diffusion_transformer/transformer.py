@@ -10,6 +10,9 @@ from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transfo
     TransformerDenoiserConfig,
 )
 
+ParameterGroup = dict[str, list[nn.Parameter] | float]
+"""Parameters of an optimizer under "params", and the options that are theirs alone."""
+
 INIT_STD = 0.02
 """Standard deviation of every initial matrix and position, as in the authors' transformer_for_diffusion.py."""
 
@@ -18,8 +21,8 @@ class TransformerDenoiser(nn.Module):
     """A decoder over the noisy actions that attends to the diffusion step and to the condition.
 
         step k ──► sinusoid ─┐
-        condition tokens ─► linear ─┴─► + positions ─► MLP or encoder ─► memory (B, 1 + C, W)
-                                                                            │ cross-attention
+        condition tokens ─► linear ─┴─► + positions ──► MLP ──► memory (B, 1 + C, W)
+                                                                    │ cross-attention
         noisy actions ──► linear ──► + positions ──► pre-norm decoder layers ──► norm ──► linear
 
     Args:
@@ -52,29 +55,37 @@ class TransformerDenoiser(nn.Module):
         self.step_embedding = DiffusionSinusoidalPosEmb(width)
         self.condition_embedding = nn.Linear(condition_dim, width)
         self.condition_positions = nn.Parameter(torch.empty(1 + n_condition_tokens, width))
-        self.condition_encoder = _condition_encoder(config)
+        self.condition_encoder = nn.Sequential(
+            nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width)
+        )
 
         self.action_embedding = nn.Linear(action_dim, width)
         self.action_positions = nn.Parameter(torch.empty(horizon, width))
-        layer = nn.TransformerDecoderLayer(**_layer_arguments(config))
+        layer = nn.TransformerDecoderLayer(
+            d_model=width,
+            nhead=config.n_heads,
+            dim_feedforward=4 * width,
+            dropout=config.attention_dropout,
+            activation="gelu",
+            batch_first=True,
+            norm_first=True,
+        )
         self.decoder = nn.TransformerDecoder(layer, config.n_layers, norm=nn.LayerNorm(width))
         self.head = nn.Linear(width, action_dim)
         self.dropout = nn.Dropout(config.dropout)
 
-        later_action = torch.ones(horizon, horizon, dtype=torch.bool).triu(diagonal=1)
-        later_observation = torch.ones(horizon, n_condition_tokens, dtype=torch.bool).triu(diagonal=1)
-        step_token = torch.zeros(horizon, 1, dtype=torch.bool)
-        masks = config.causal, config.causal and condition_is_history
-        self.register_buffer("causal_mask", later_action if masks[0] else None, persistent=False)
-        memory_mask = torch.cat([step_token, later_observation], dim=1) if masks[1] else None
+        hides_observations = config.causal and condition_is_history
+        causal_mask = _later(horizon, horizon) if config.causal else None
+        memory_mask = _memory_mask(horizon, n_condition_tokens) if hides_observations else None
+        self.register_buffer("causal_mask", causal_mask, persistent=False)
         self.register_buffer("memory_mask", memory_mask, persistent=False)
-        self._initialise()
+        self._initialize()
 
     def forward(self, x: Tensor, timestep: Tensor | int, global_cond: Tensor) -> Tensor:
-        """Predict noise (or the clean chunk).
+        """Predict the clean chunk (or the noise).
 
         Args:
-            x: (B, H, A) noisy chunk, normalised.
+            x: (B, H, A) noisy chunk, normalized.
             timestep: (B,) diffusion steps, or one for all.
             global_cond: (B, C * D) condition tokens, flattened.
 
@@ -97,7 +108,7 @@ class TransformerDenoiser(nn.Module):
         )
         return self.head(decoded)
 
-    def _initialise(self) -> None:
+    def _initialize(self) -> None:
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.normal_(module.weight, std=INIT_STD)
@@ -109,32 +120,22 @@ class TransformerDenoiser(nn.Module):
         nn.init.normal_(self.action_positions, std=INIT_STD)
 
 
-def _layer_arguments(config: TransformerDenoiserConfig) -> dict:
-    return {
-        "d_model": config.width,
-        "nhead": config.n_heads,
-        "dim_feedforward": 4 * config.width,
-        "dropout": config.attention_dropout,
-        "activation": "gelu",
-        "batch_first": True,
-        "norm_first": True,
-    }
+def _later(n_steps: int, n_tokens: int) -> Tensor:
+    """Mask (n_steps, n_tokens) that hides token j from step i < j."""
+    return torch.ones(n_steps, n_tokens, dtype=torch.bool).triu(diagonal=1)
 
 
-def _condition_encoder(config: TransformerDenoiserConfig) -> nn.Module:
-    """Maps (B, 1 + C, W) to itself: encoder layers over all tokens, or an MLP on each."""
-    if config.n_condition_layers == 0:
-        width = config.width
-        return nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
-    layer = nn.TransformerEncoderLayer(**_layer_arguments(config))
-    return nn.TransformerEncoder(layer, config.n_condition_layers, enable_nested_tensor=False)
+def _memory_mask(horizon: int, n_condition_tokens: int) -> Tensor:
+    """Mask (H, 1 + C) that hides later observations; the diffusion step's token is seen by all."""
+    step_token = torch.zeros(horizon, 1, dtype=torch.bool)
+    return torch.cat([step_token, _later(horizon, n_condition_tokens)], dim=1)
 
 
-def weight_decay_groups(model: nn.Module) -> list[dict]:
-    """Parameter groups of which only the matrices of linear and attention layers decay.
+def weight_decay_groups(model: nn.Module) -> list[ParameterGroup]:
+    """Split the trainable parameters into matrices of linear and attention layers, and all others.
 
-    Biases, norms, embeddings, positions and convolutions are in the second group. The first takes the
-    optimizer's own weight decay.
+    The first group takes the optimizer's weight decay; biases, norms, embeddings, positions and convolutions do
+    not decay.
     """
     decaying = {
         parameter
