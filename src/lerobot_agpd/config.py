@@ -213,8 +213,7 @@ class AdversaryConfig:
 class StudentConfig(PreTrainedConfig):
     """Configuration of a student: the groups of the method beside those of a LeRobot policy.
 
-    A concrete class names it before the policy's own configuration. Fields of PreTrainedConfig to which that gives
-    another default are declared again there, since dataclasses take the first base's.
+    A concrete class names it behind the policy's own configuration, whose defaults then count.
     """
 
     teacher: TeacherConfig = field(default_factory=TeacherConfig)

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from draccus.utils import DraccusException
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.envs import EnvConfig
@@ -40,9 +41,15 @@ def read_policy_config(path: str | Path, flag: str) -> PreTrainedConfig:
 
     Raises:
         FileNotFoundError: if there is no policy at the path.
+        FlagError: if its configuration holds fields that this version does not have.
     """
     try:
         config = PreTrainedConfig.from_pretrained(path)
+    except DraccusException as error:
+        raise FlagError(
+            f"{flag}='{path}': its config.json was written by another version of its policy's package ({error}); load it "
+            "with that version, or remove from the file what this version does not have"
+        ) from error
     except Exception as error:
         raise FileNotFoundError(
             f"{flag}='{path}' is neither a folder with a policy's config.json nor a Hub repository that can be "

@@ -19,28 +19,30 @@ from lerobot_agpd.studies.training import check_same_command
 
 logger = logging.getLogger(__name__)
 
+Phase = Literal["all", "train", "evaluate", "report"]
+
 
 @dataclass
 class CompareConfig:
     """Options of `lerobot-agpd-compare`."""
 
-    # YAML of the comparison, see benchmarks/comparison
+    # YAML of the comparison, see benchmarks/comparison.
     matrix: Path
-    # folder of runs and report; default: the matrix's
+    # Folder of runs and report; default: the matrix's.
     output: Path | None = None
-    # a part of the work; a single run is evaluated in this process
-    only: Literal["all", "train", "evaluate", "report"] = "all"
-    # part of the matrix's tasks; default: all
+    # A part of the work; a single run is evaluated in this process.
+    only: Phase = "all"
+    # Part of the matrix's tasks; default: all.
     tasks: list[str] = field(default_factory=list)
-    # part of its methods; default: all
+    # Part of its methods; default: all.
     methods: list[str] = field(default_factory=list)
-    # part of its training seeds; default: all
+    # Part of its training seeds; default: all.
     seeds: list[int] = field(default_factory=list)
-    # runs at a time
+    # Runs at a time.
     jobs: int = 1
-    # OMP_NUM_THREADS of each
+    # OMP_NUM_THREADS of each.
     threads: int = 1
-    # print the commands and stop
+    # Print the commands and stop.
     dry_run: bool = False
 
     def __post_init__(self) -> None:

@@ -41,19 +41,19 @@ REPORT_PATH = Path("meta/demos.json")
 class DemosConfig:
     """Options of `lerobot-agpd-demos`."""
 
-    # folder of the new dataset; must not exist
+    # Folder of the new dataset; must not exist.
     root: Path
-    # environment, whose task needs a scripted expert
+    # Environment, whose task needs a scripted expert.
     env: EnvConfig = field(default_factory=lambda: EnvConfig.get_choice_class("gymnasium_robotics")())
-    # name of the new dataset
+    # Name of the new dataset.
     repo_id: str = "local/demos"
-    # successful episodes to record
+    # Successful episodes to record.
     episodes: int = 50
-    # attempt i starts from environment seed `seed + i`
+    # Attempt i starts from environment seed `seed + i`.
     seed: int = 0
-    # 1 is the expert, 0 the worst operator; "[1,0.5]": two operators in turn
+    # 1 is the expert, 0 the worst operator; "[1,0.5]": two operators in turn.
     skill: float | list[float] = 1.0
-    # upload the dataset when it is done
+    # Upload the dataset when it is done.
     push_to_hub: bool = False
 
     def __post_init__(self) -> None:

@@ -33,25 +33,25 @@ STUDENT = Setting("interpolate", 1.0)
 class DiversityConfig:
     """Options of `lerobot-agpd-diversity`."""
 
-    # environment to act in
+    # Environment to act in.
     env: EnvConfig
-    # folder of sweep.json, frontier.png and trajectories.png
+    # Folder of sweep.json, frontier.png and trajectories.png.
     output: Path
-    # the student: --policy.path=<checkpoint of a distilled policy>
+    # The student: --policy.path=<checkpoint of a distilled policy>.
     policy: PreTrainedConfig | None = None
-    # flags that are not set are the checkpoint's
+    # Flags that are not set are the checkpoint's.
     teacher: TeacherConfig = field(default_factory=TeacherConfig)
-    # scales of guidance
+    # Scales of guidance.
     scales: list[float] = field(default_factory=lambda: [0.5, 2.0, 8.0, 32.0, 128.0])
-    # weights of mixing
+    # Weights of mixing.
     lambdas: list[float] = field(default_factory=lambda: [0.05, 0.1, 0.2, 0.4, 0.7])
-    # forms of mixing
+    # Forms of mixing.
     forms: list[MixingForm] = field(default_factory=lambda: ["interpolate", "switch"])
-    # episodes per setting, from the same environment seeds
+    # Episodes per setting, from the same environment seeds.
     episodes: int = 40
-    # first environment seed; also seeds the noise
+    # First environment seed; also seeds the noise.
     seed: int = EVALUATION_SEEDS[0] + 500_000
-    # state dimensions of the trajectories' picture
+    # State dimensions of the trajectories' picture.
     axes: list[int] = field(default_factory=lambda: [0, 1])
 
     def __post_init__(self) -> None:

@@ -31,13 +31,13 @@ TOLERANCE = 1e-6
 class ExportConfig:
     """Options of `lerobot-agpd-export`."""
 
-    # pretrained_model folder (or Hub repository) of a student or teacher of this plugin
+    # Pretrained_model folder (or Hub repository) of a student or teacher of this plugin.
     checkpoint: str
-    # folder of the plain checkpoint; must not exist
+    # Folder of the plain checkpoint; must not exist.
     output: Path
-    # Hub repository to upload to
+    # Hub repository to upload to.
     repo_id: str | None = None
-    # upload the result
+    # Upload the result.
     push_to_hub: bool = False
 
     def __post_init__(self) -> None:

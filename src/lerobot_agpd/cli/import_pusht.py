@@ -30,21 +30,21 @@ Variant = Literal["keypoints", "state", "image"]
 class ImportPushTConfig:
     """Options of `lerobot-agpd-import-pusht`."""
 
-    # Diffusion Policy's replay buffer, a zarr folder or a zip of it, or its arrays in an .npz file
+    # Diffusion Policy's replay buffer, a zarr folder or a zip of it, or its arrays in an .npz file.
     source: Path
-    # folder of the new dataset; must not exist
+    # Folder of the new dataset; must not exist.
     root: Path
-    # name of the new dataset
+    # Name of the new dataset.
     repo_id: str = "local/pusht_keypoints"
-    # observation beside the agent's position: the block's corners (keypoints) or pose (state), or a 96x96 image
+    # Observation beside the agent's position: the block's corners (keypoints) or pose (state), or a 96x96 image.
     variant: Variant = "keypoints"
-    # episodes to keep, e.g. "[0,1,2]"; default: all
+    # Episodes to keep, e.g. "[0,1,2]"; default: all.
     episodes: list[int] | None = None
-    # shorthand: keep episodes 0 to n-1
+    # shorthand: keep episodes 0 to n-1.
     first_episodes: int | None = None
-    # .npz file with the array img, if it is not in source
+    # .npz file with the array img, if it is not in source.
     images: Path | None = None
-    # upload the dataset when it is done
+    # Upload the dataset when it is done.
     push_to_hub: bool = False
 
     def __post_init__(self) -> None:

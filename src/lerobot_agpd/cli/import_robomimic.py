@@ -33,27 +33,27 @@ REPORT_PATH = Path("meta/robomimic.json")
 class ImportRobomimicConfig:
     """Options of `lerobot-agpd-import-robomimic`; `--source=` may be left out before the first word."""
 
-    # robomimic's file with observations, such as low_dim_v15.hdf5
+    # robomimic's file with observations, such as low_dim_v15.hdf5.
     source: Path
-    # folder of the new dataset; must not exist
+    # Folder of the new dataset; must not exist.
     root: Path
-    # name of the new dataset
+    # Name of the new dataset.
     repo_id: str = "local/robomimic"
-    # episodes to keep, e.g. "[0,1]", demo_0 first; default: all
+    # Episodes to keep, e.g. "[0,1]", demo_0 first; default: all.
     episodes: list[int] | None = None
-    # keep the demonstrations of this mask of the file, e.g. 20_percent
+    # Keep the demonstrations of this mask of the file, e.g. 20_percent.
     filter_key: str | None = None
-    # import camera images, and not the objects' state
+    # Import camera images, and not the objects' state.
     images: bool = False
-    # cameras to import with --images=true, e.g. "[agentview]"; default: all of the file
+    # Cameras to import with --images=true, e.g. "[agentview]"; default: all of the file.
     cameras: list[str] | None = None
-    # import the objects' state; default: unless --images=true
+    # Import the objects' state; default: unless --images=true.
     environment_state: bool | None = None
-    # store images as video, smaller but lossy; default: PNG
+    # Store images as video, smaller but lossy; default: PNG.
     video: bool = False
-    # a killed import goes on, and repeats at most this many episodes
+    # A killed import goes on, and repeats at most this many episodes.
     episodes_per_shard: int = 20
-    # upload the dataset when it is done
+    # Upload the dataset when it is done.
     push_to_hub: bool = False
 
     def __post_init__(self) -> None:

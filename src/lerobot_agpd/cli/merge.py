@@ -17,11 +17,11 @@ logger = logging.getLogger(__name__)
 class MergeConfig:
     """Options of `lerobot-agpd-merge`; a run that reaches its last step merges by itself."""
 
-    # folder of a run's collected episodes, <output_dir>/agpd; the run may still be going
+    # Folder of a run's collected episodes, <output_dir>/agpd; the run may still be going.
     root: Path
-    # name of the merged dataset, and its Hub repository; default: after the run
+    # Name of the merged dataset, and its Hub repository; default: after the run.
     repo_id: str | None = None
-    # upload it
+    # Upload it.
     push_to_hub: bool = False
 
     def __post_init__(self) -> None:

@@ -26,27 +26,27 @@ logger = logging.getLogger(__name__)
 class ReportConfig:
     """Options of `lerobot-agpd-report`."""
 
-    # environment to evaluate in
+    # Environment to evaluate in.
     env: EnvConfig
-    # folder of report.json, report.md, curves.png and the single evaluations, which a second call reuses
+    # Folder of report.json, report.md, curves.png and the single evaluations, which a second call reuses.
     output: Path
-    # name to output folder of a lerobot-train run
+    # Name to output folder of a lerobot-train run.
     runs: dict[str, Path] = field(default_factory=dict)
-    # name to a single checkpoint, such as the teacher
+    # Name to a single checkpoint, such as the teacher.
     policies: dict[str, Path] = field(default_factory=dict)
-    # episodes of the final evaluation
+    # Episodes of the final evaluation.
     episodes: int = 200
-    # episodes at every earlier checkpoint; 0: no learning curve
+    # Episodes at every earlier checkpoint; 0: no learning curve.
     curve_episodes: int = 0
-    # steps executed per prediction, e.g. "[8,2]": one row each; default: the checkpoint's
+    # Steps executed per prediction, e.g. "[8,2]": one row each; default: the checkpoint's.
     n_action_steps: list[int] = field(default_factory=list)
-    # environments side by side
+    # Environments side by side.
     batch_size: int = 50
-    # first environment seed; training and collection stay away from 100000 to 999999
+    # First environment seed; training and collection stay away from 100000 to 999999.
     seed: int = EVALUATION_SEEDS[0]
-    # where policies run
+    # Where policies run.
     device: str = "cpu"
-    # title of the picture
+    # Title of the picture.
     title: str = ""
 
     def __post_init__(self) -> None:

@@ -38,25 +38,25 @@ APPLICATION = "lerobot-agpd-viz"
 class VizConfig:
     """Options of `lerobot-agpd-viz`."""
 
-    # environment to act in
+    # Environment to act in.
     env: EnvConfig
-    # the student: --policy.path=<checkpoint of a distilled policy>
+    # The student: --policy.path=<checkpoint of a distilled policy>.
     policy: PreTrainedConfig | None = None
-    # flags that are not set are the checkpoint's
+    # Flags that are not set are the checkpoint's.
     teacher: TeacherConfig = field(default_factory=TeacherConfig)
-    # episodes to record
+    # Episodes to record.
     episodes: int = 1
-    # environment seed of the first episode; also seeds the noise
+    # Environment seed of the first episode; also seeds the noise.
     seed: int = EVALUATION_SEEDS[0]
-    # guidance scale; default: that of the run's next round, else the policy's
+    # Guidance scale; default: that of the run's next round, else the policy's.
     scale: float | None = None
-    # recording to write
+    # Recording to write.
     output: Path = Path("outputs/rollout.rrd")
-    # still picture of the first episode to draw
+    # Still picture of the first episode to draw.
     png: Path | None = None
-    # record rendered frames
+    # Record rendered frames.
     render: bool = True
-    # show the finished recording in a rerun viewer
+    # Show the finished recording in a rerun viewer.
     open: bool = False
 
     def __post_init__(self) -> None:

@@ -68,27 +68,27 @@ def make_single_env(task: str, episode_length: int, kwargs: dict[str, Any]) -> g
 class AlohaStateEnvConfig(SingleEnvConfig, LeRobotAlohaEnv):
     """ALOHA's simulated tasks, seen through joints and object poses, or through cameras of any size."""
 
-    # AlohaTransferCube-v0 or AlohaInsertion-v0
+    # AlohaTransferCube-v0 or AlohaInsertion-v0.
     task: Task | None = "AlohaTransferCube-v0"
-    # control steps per second; ALOHA has 50 only
+    # Control steps per second; ALOHA has 50 only.
     fps: int = FPS
-    # steps after which an episode is truncated
+    # Steps after which an episode is truncated.
     episode_length: int = 400
-    # what is observed
+    # What is observed.
     obs_type: ObsType = "environment_state_agent_pos"
-    # cameras to observe, e.g. "[top,angle]"
+    # Cameras to observe, e.g. "[top,angle]".
     cameras: list[Camera] = field(default_factory=lambda: ["top"])
-    # height of observed images, pixels
+    # Height of observed images, pixels.
     observation_height: int = 240
-    # width of observed images, pixels
+    # Width of observed images, pixels.
     observation_width: int = 320
-    # height of rendered frames, pixels
+    # Height of rendered frames, pixels.
     visualization_height: int = 480
-    # width of rendered frames, pixels
+    # Width of rendered frames, pixels.
     visualization_width: int = 640
-    # draw shadows; without a GPU an image is many times faster without
+    # Draw shadows; without a GPU an image is many times faster without.
     shadows: bool = True
-    # gymnasium's render mode; nothing is rendered before `render` is called
+    # gymnasium's render mode; nothing is rendered before `render` is called.
     render_mode: RenderMode = "rgb_array"
 
     def __post_init__(self) -> None:

@@ -80,31 +80,31 @@ def make_single_env(
 class GymnasiumRoboticsEnv(SingleEnvConfig, EnvConfig):
     """Tasks of Gymnasium-Robotics, seen through their state or one camera."""
 
-    # task of Gymnasium-Robotics
+    # Task of Gymnasium-Robotics.
     task: Task | None = "FetchPickAndPlace-v4"
-    # control steps per second; default: the task's, the only possible value
+    # Control steps per second; default: the task's, the only possible value.
     fps: int | None = None
-    # steps after which an episode is truncated; default: the task's own limit
+    # Steps after which an episode is truncated; default: the task's own limit.
     episode_length: int | None = None
-    # what is observed
+    # What is observed.
     obs_type: ObsType = "state"
-    # width of observed images, pixels
+    # Width of observed images, pixels.
     observation_width: int = 96
-    # height of observed images, pixels
+    # Height of observed images, pixels.
     observation_height: int = 96
-    # gymnasium's render mode; nothing is rendered before `render` is called
+    # gymnasium's render mode; nothing is rendered before `render` is called.
     render_mode: RenderMode = "rgb_array"
-    # width of rendered frames, pixels
+    # Width of rendered frames, pixels.
     visualization_width: int = 480
-    # height of rendered frames, pixels
+    # Height of rendered frames, pixels.
     visualization_height: int = 480
-    # draw shadows; without a GPU Adroit's images are several times faster without
+    # Draw shadows; without a GPU Adroit's images are several times faster without.
     shadows: bool = True
-    # FrankaKitchen-v1 only: the tasks that make a success, e.g. "[kettle]"; default: D4RL's kitchen-complete
+    # FrankaKitchen-v1 only: the tasks that make a success, e.g. "[kettle]"; default: D4RL's kitchen-complete.
     tasks_to_complete: list[KitchenTask] | None = None
-    # derived from the task
+    # Derived from the task.
     features: dict[str, PolicyFeature] = field(default_factory=dict)
-    # raw key to LeRobot key, derived from the task
+    # Raw key to LeRobot key, derived from the task.
     features_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -47,29 +47,29 @@ def make_single_env(task: str, episode_length: int, view_kwargs: dict[str, Any],
 class RobomimicEnvConfig(SingleEnvConfig, EnvConfig):
     """Tasks of robomimic with one Panda, or two, seen through their state or through cameras."""
 
-    # task of robomimic
+    # Task of robomimic.
     task: Task | None = "lift"
-    # control steps per second; robomimic has 20 only
+    # Control steps per second; robomimic has 20 only.
     fps: int = FPS
-    # steps after which an episode is truncated; default: robomimic's horizon for its proficient-human data
+    # Steps after which an episode is truncated; default: robomimic's horizon for its proficient-human data.
     episode_length: int | None = None
-    # what is observed
+    # What is observed.
     obs_type: ObsType = "state"
-    # cameras to observe, e.g. "[agentview]"; default: those of robomimic's image datasets
+    # Cameras to observe, e.g. "[agentview]"; default: those of robomimic's image datasets.
     cameras: list[str] | None = None
-    # height of observed images, pixels; robomimic has 240 for tool_hang
+    # Height of observed images, pixels; robomimic has 240 for tool_hang.
     observation_height: int = 84
-    # width of observed images, pixels
+    # Width of observed images, pixels.
     observation_width: int = 84
-    # height of rendered frames, pixels
+    # Height of rendered frames, pixels.
     visualization_height: int = 480
-    # width of rendered frames, pixels
+    # Width of rendered frames, pixels.
     visualization_width: int = 480
-    # gymnasium's render mode; nothing is rendered before `render` is called
+    # gymnasium's render mode; nothing is rendered before `render` is called.
     render_mode: RenderMode = "rgb_array"
-    # derived from the task
+    # Derived from the task.
     features: dict[str, PolicyFeature] = field(default_factory=dict)
-    # raw key to LeRobot key, derived from the task
+    # Raw key to LeRobot key, derived from the task.
     features_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -25,22 +25,24 @@ OWN_FLAGS = ("seed", "output_dir", "resume", "policy.teacher.path", "policy.repl
 
 NAME = re.compile(r"[\w.+-]+")
 
+Measure = Literal["success", "max_reward"]
+
 
 @dataclass
 class TaskEntry:
     """What is to be learned."""
 
-    # environment, as in --env.*; `discover_packages_path` names a package that registers its type
+    # Environment, as in --env.*; `discover_packages_path` names a package that registers its type.
     env: dict[str, Any]
-    # demonstrations, as in --dataset.*
+    # Demonstrations, as in --dataset.*.
     dataset: dict[str, Any]
-    # checkpoint of the teacher: folder or Hub repository
+    # Checkpoint of the teacher: folder or Hub repository.
     teacher: str = ""
-    # flags of lerobot-train for this task
+    # Flags of lerobot-train for this task.
     flags: dict[str, Any] = field(default_factory=dict)
-    # what the best checkpoint is chosen by, and curves show
-    measure: Literal["success", "max_reward"] = "success"
-    # as shown; default: the task's name
+    # What the best checkpoint is chosen by, and curves show.
+    measure: Measure = "success"
+    # As shown; default: the task's name.
     title: str = ""
 
     def __post_init__(self) -> None:
@@ -52,13 +54,13 @@ class TaskEntry:
 class MethodEntry:
     """How it is learned: flags of lerobot-train, or a policy that is only evaluated."""
 
-    # flags of lerobot-train for this method
+    # Flags of lerobot-train for this method.
     flags: dict[str, Any] = field(default_factory=dict)
-    # a checkpoint to evaluate instead of training; '{teacher}' stands for the task's teacher
+    # A checkpoint to evaluate instead of training; '{teacher}' stands for the task's teacher.
     policy: str = ""
-    # whether it is given the task's teacher (--policy.teacher.path)
+    # Whether it is given the task's teacher (--policy.teacher.path).
     teacher: bool = True
-    # one line for the report: what the method is
+    # One line for the report: what the method is.
     note: str = ""
 
     def __post_init__(self) -> None:
@@ -77,17 +79,17 @@ class MethodEntry:
 class EvaluationEntry:
     """Environments of the evaluations; the same for every method."""
 
-    # episodes of the final evaluation of the best and of the last checkpoint
+    # Episodes of the final evaluation of the best and of the last checkpoint.
     episodes: int = 500
-    # their first environment seed
+    # Their first environment seed.
     seed: int = EVALUATION_SEEDS[0]
-    # episodes at every checkpoint, for the curve and to choose the best
+    # Episodes at every checkpoint, for the curve and to choose the best.
     curve_episodes: int = 22
-    # their first environment seed
+    # Their first environment seed.
     curve_seed: int = 500_000
-    # environments side by side
+    # Environments side by side.
     batch_size: int = 22
-    # where policies are evaluated
+    # Where policies are evaluated.
     device: str = "cpu"
 
     def __post_init__(self) -> None:
@@ -125,7 +127,7 @@ class Matrix:
     output: Path
     common: dict[str, Any] = field(default_factory=dict)
     evaluation: EvaluationEntry = field(default_factory=EvaluationEntry)
-    # methods that all are compared with; default: all
+    # Methods that all are compared with; default: all.
     references: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:

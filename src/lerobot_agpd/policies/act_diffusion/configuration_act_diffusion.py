@@ -18,6 +18,9 @@ from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transfo
 RESNET_STRIDE = 32
 """Pixels per cell of the feature map that ACT's ResNet returns."""
 
+ACTDenoiser = Literal["transformer"]
+"""The only denoiser that attends to ACT's tokens."""
+
 
 def _default_head() -> TransformerDenoiserConfig:
     return TransformerDenoiserConfig(width=512, n_layers=4, n_heads=8, attention_dropout=0.1, causal=False)
@@ -45,7 +48,7 @@ class ACTDiffusionConfig(DiffusionTransformerConfig):
     do_mask_loss_for_padding: bool = True
 
     # Network that denoises; the transformer is the only one that attends to ACT's tokens.
-    denoiser: Literal["transformer"] = "transformer"
+    denoiser: ACTDenoiser = "transformer"
     # The prediction head.
     transformer: TransformerDenoiserConfig = field(default_factory=_default_head)
 

@@ -13,7 +13,7 @@ from lerobot_agpd.config import StudentConfig, require
 
 @PreTrainedConfig.register_subclass("agpd")
 @dataclass
-class AGPDConfig(StudentConfig, ACTConfig):
+class AGPDConfig(ACTConfig, StudentConfig):
     """LeRobot's ACT with the groups of the distillation; all of ACT's fields keep their meaning and defaults."""
 
     # As LeRobot's ACT, and observation.environment_state too, which that one takes as it is.

@@ -14,14 +14,11 @@ from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transfo
 
 @PreTrainedConfig.register_subclass("agpd_diffusion")
 @dataclass
-class AGPDDiffusionConfig(StudentConfig, DiffusionTransformerConfig):
+class AGPDDiffusionConfig(DiffusionTransformerConfig, StudentConfig):
     """A diffusion policy (`denoiser` transformer: DP-T, unet: DP-C, or mlp) with the groups of the distillation.
 
     With `teacher.path` it learns from that teacher; without, from itself (self-distillation).
     """
-
-    # Observations in a history (declared again: StudentConfig's base has 1).
-    n_obs_steps: int = 2
 
     def _check_memory(self) -> None:
         """Images are allowed: T reads those from disk."""

@@ -14,6 +14,10 @@ from lerobot_agpd.config import require
 UNUSED_DOWN_DIMS = (16,)
 """Size of the U-Net that LeRobot's DiffusionModel always builds, where another denoiser replaces it."""
 
+# Named, not spelled out at the fields: the flag parser finds a field's comment only if its annotation is plain words.
+PredictionType = Literal["sample", "epsilon"]
+Denoiser = Literal["mlp", "transformer", "unet"]
+
 
 @dataclass
 class MLPDenoiserConfig:
@@ -96,9 +100,9 @@ class DiffusionTransformerConfig(DiffusionConfig):
         }
     )
     # What the denoiser predicts: the clean chunk (sample), or the noise (epsilon).
-    prediction_type: Literal["sample", "epsilon"] = "sample"
+    prediction_type: PredictionType = "sample"
     # Network that denoises.
-    denoiser: Literal["mlp", "transformer", "unet"] = "mlp"
+    denoiser: Denoiser = "mlp"
     mlp: MLPDenoiserConfig = field(default_factory=MLPDenoiserConfig)
     transformer: TransformerDenoiserConfig = field(default_factory=TransformerDenoiserConfig)
     # Average the weights (EMA, as in arXiv:2303.04137) and save the average as the policy's weights.
