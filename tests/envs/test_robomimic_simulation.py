@@ -239,6 +239,7 @@ def test_images_are_robosuites_turned_the_right_way_up(rendering):
     env.close()
 
 
+@pytest.mark.slow
 def test_space_of_the_images():
     env = RobosuiteEnv("lift", View("pixels", ("sideview",), (24, 32)))
     assert isinstance(env.observation_space[PIXELS], gym.spaces.Dict)
