@@ -66,9 +66,9 @@ def interrupted(n_episodes: int, error: BaseException):
 PLAN = {"plan": {"source": "x"}, "episodes_per_shard": 2}
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError("disk full")])
-def test_a_run_with_a_plan_goes_on(tmp_path, error):
-    with pytest.raises(type(error)):
+def test_a_run_with_a_plan_goes_on(tmp_path):
+    error = OSError("disk full")
+    with pytest.raises(OSError):
         writer(tmp_path, **PLAN).write(interrupted(4, error))
     begun = []
 

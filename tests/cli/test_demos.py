@@ -130,6 +130,7 @@ def test_less_skill_means_longer_ways(mixture):
     assert wobble(0.25) > 2 * wobble(1.0)
 
 
+@pytest.mark.slow
 def test_images_are_recorded_where_they_are_observed(rendering, tmp_path):
     env = GymnasiumRoboticsEnv(
         task=REACH,
@@ -163,7 +164,7 @@ def test_rates_leave_starts_at_the_goal_out_or_count_them():
 
 
 def test_starts_at_the_goal_and_failures_are_left_out_and_counted(tmp_path):
-    config = reach_config(tmp_path / "x", episodes=40)
+    config = reach_config(tmp_path / "x", episodes=12)
     env = config.env.make_single()
     solved = [seed for seed in range(60) if env.reset(seed=seed)[1]["is_success"]]
     assert solved, "choose a range of seeds with a start at the goal"
@@ -177,8 +178,8 @@ def test_starts_at_the_goal_and_failures_are_left_out_and_counted(tmp_path):
 
     report = DemosReport(task=REACH)
     expert = Expert(expert_that_fails_its_first_episode)
-    episodes = successful_episodes(env, expert, config.env.features_map, [1.0], 40, config.seeds, report)
-    assert len(list(episodes)) == len(report.seeds) == 40
+    episodes = successful_episodes(env, expert, config.env.features_map, [1.0], 12, config.seeds, report)
+    assert len(list(episodes)) == len(report.seeds) == 12
     assert report.solved_at_start_seeds == [seed for seed in solved if seed <= report.seeds[-1]]
     assert report.failed_seeds == [next(seed for seed in range(60) if seed not in solved)]
     seeds = report.seeds + report.solved_at_start_seeds + report.failed_seeds

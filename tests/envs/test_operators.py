@@ -112,9 +112,8 @@ def test_impossible_skill_is_refused(skill):
         Operator(Expert(lambda observation: STILL), skill, np.random.default_rng(0))
 
 
-@pytest.mark.parametrize(
-    "task", [pytest.param(t, marks=() if t == "FetchReach-v4" else pytest.mark.slow) for t in EXPERTS]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("task", EXPERTS)
 def test_less_skill_succeeds_less_often_but_not_never(task):
     pytest.importorskip("gymnasium_robotics")
     env = GymnasiumRoboticsEnv(task=task, episode_length=100).make_single()

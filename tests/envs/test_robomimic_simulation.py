@@ -15,7 +15,7 @@ pytest.importorskip("robosuite")
 
 from lerobot_agpd.envs.robosuite_sim import RobosuiteEnv, View  # noqa: E402
 
-ALL_TASKS = [pytest.param(t, marks=() if t in ("lift", "can") else pytest.mark.slow) for t in TASKS]
+ALL_TASKS = [pytest.param(t, marks=() if t == "lift" else pytest.mark.slow) for t in TASKS]
 
 
 @pytest.fixture(scope="module")

@@ -78,6 +78,7 @@ def test_interrupted_import_goes_on(source, rollouts, tmp_path, monkeypatch):
         np.testing.assert_array_equal(column(dataset, "action", episode), expected)
 
 
+@pytest.mark.slow
 def test_import_killed_while_merging_goes_on(source, tmp_path, monkeypatch):
     def die(*args, **kwargs):
         raise KeyboardInterrupt
