@@ -153,14 +153,16 @@ class DatasetWriter:
             robot_type=self.robot_type,
             use_videos=self.use_videos,
         )
-        for frames in episodes:
-            for frame in frames:
-                dataset.add_frame(frame)
-            dataset.save_episode()
-            on_episode()
+        try:
+            for frames in episodes:
+                for frame in frames:
+                    dataset.add_frame(frame)
+                dataset.save_episode()
+                on_episode()
+        finally:  # LeRobot would do it at garbage collection, and create a folder again that was removed
+            dataset.finalize()
         if not dataset.num_episodes:
             raise ValueError(f"no episode to write to {self.root}")
-        dataset.finalize()
         unfinished.rename(folder)
         return folder
 

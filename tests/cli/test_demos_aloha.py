@@ -11,6 +11,7 @@ from lerobot_agpd.cli import demos
 from lerobot_agpd.envs.aloha import AlohaStateEnvConfig
 
 pytest.importorskip("gym_aloha")
+pytestmark = pytest.mark.slow
 
 ENV_OPTIONS = {"observation_height": 12, "observation_width": 16, "shadows": False}
 

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_agpd.cli.import_pusht import ImportPushTConfig, block_geometry, import_pusht, load_arrays
+from lerobot_agpd.cli import import_pusht as command
+from lerobot_agpd.cli.import_pusht import ImportPushTConfig, import_pusht
+from lerobot_agpd.envs.pusht_recordings import block_geometry, load_arrays
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 REAL, REAL_IMAGES = DATA / "pusht_human_lowdim.npz", DATA / "pusht_human_images.npz"
@@ -103,17 +105,16 @@ def test_replay_buffer_holds_what_the_npz_holds(source, buffer, tmp_path, form):
         "zip": lambda: zipped(buffer, "."),
         "nested zip": lambda: zipped(buffer, "pusht/pusht_replay.zarr"),
     }[form]()
-    options = {"root": tmp_path / "data", "variant": "image"}
-    expected = load_arrays(ImportPushTConfig(source=source, **options))
-    arrays = load_arrays(ImportPushTConfig(source=path, **options))
+    expected = load_arrays(source, with_images=True)
+    arrays = load_arrays(path, with_images=True)
     assert set(arrays) == set(expected) == {"state", "action", "img", "episode_ends"}
     for key, values in expected.items():
         np.testing.assert_array_equal(arrays[key], values)
     assert arrays["img"].dtype == np.uint8
 
 
-def test_images_are_left_unread_unless_needed(buffer, tmp_path):
-    assert "img" not in load_arrays(ImportPushTConfig(source=buffer, root=tmp_path / "data"))
+def test_images_are_left_unread_unless_needed(buffer):
+    assert "img" not in load_arrays(buffer)
 
 
 def test_replay_buffer_is_imported(buffer, tmp_path):
@@ -124,13 +125,13 @@ def test_replay_buffer_is_imported(buffer, tmp_path):
 def test_missing_zarr_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "zarr", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'lerobot_policy_agpd\[zarr\]'"):
-        load_arrays(ImportPushTConfig(source=tmp_path, root=tmp_path / "data"))
+        load_arrays(tmp_path)
 
 
 def test_folder_without_a_replay_buffer_is_refused(tmp_path):
     pytest.importorskip("zarr")
     with pytest.raises(ValueError, match="no replay buffer.*meta/episode_ends"):
-        load_arrays(ImportPushTConfig(source=tmp_path, root=tmp_path / "data"))
+        load_arrays(tmp_path)
 
 
 def test_state_variant_holds_the_block_pose(source, tmp_path):
@@ -142,7 +143,7 @@ def test_state_variant_holds_the_block_pose(source, tmp_path):
 
 def test_chosen_episodes_are_imported_without_loss(source, tmp_path):
     dataset = import_pusht(ImportPushTConfig(source=source, root=tmp_path / "data", episodes=[0, 2]))
-    arrays = load_arrays(ImportPushTConfig(source=source, root=tmp_path / "other"))
+    arrays = load_arrays(source)
     assert [dataset.num_episodes, dataset.num_frames] == [2, 8]
     rows = [0, 1, 2, 4, 5, 6, 7, 8]
     for item, row in zip(dataset, rows, strict=True):
@@ -159,20 +160,86 @@ def test_images(source, tmp_path):
         np.testing.assert_array_equal(shown, arrays["img"][1])
 
 
-def test_wrong_input_is_named(source, tmp_path):
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"first_episodes": 0}, "--first_episodes .* 0"),
+        ({"first_episodes": -3}, "--first_episodes .* -3"),
+        ({"first_episodes": 4}, "--first_episodes=4: .* has 3 episodes"),
+        ({"episodes": []}, r"--episodes=\[\]"),
+        ({"episodes": [-1]}, r"--episodes=\[-1\]"),
+        ({"episodes": [1, 1]}, r"--episodes=\[1, 1\]"),
+        ({"episodes": [0, 7]}, r"--episodes=\[0, 7\]: .* has 3 episodes"),
+        ({"episodes": [0], "first_episodes": 1}, "either --episodes or --first_episodes"),
+    ],
+)
+def test_episodes_that_are_not_there_are_refused(source, tmp_path, options, message):
+    with pytest.raises(ValueError, match=message):
+        import_pusht(ImportPushTConfig(source=source, root=tmp_path / "data", **options))
+    assert not list(tmp_path.glob("data*"))
+
+
+def test_folders_that_are_wrong_are_refused(source, tmp_path):
     with pytest.raises(FileNotFoundError, match="--source="):
         ImportPushTConfig(source=tmp_path / "nothing.npz", root=tmp_path / "data")
+    with pytest.raises(FileNotFoundError, match="--images="):
+        ImportPushTConfig(source=source, images=tmp_path / "nothing.npz", root=tmp_path / "data")
     with pytest.raises(FileExistsError, match="--root="):
         ImportPushTConfig(source=source, root=tmp_path)
-    with pytest.raises(ValueError, match="--variant"):
-        ImportPushTConfig(source=source, root=tmp_path / "data", variant="pixels")
-    with pytest.raises(ValueError, match="episode 7 was asked for, .* has 3"):
-        import_pusht(ImportPushTConfig(source=source, root=tmp_path / "data", episodes=[7]))
-    np.savez(tmp_path / "foreign.npz", something=np.zeros(3))
-    with pytest.raises(
-        KeyError, match=r"no array \['state', 'action', 'episode_ends'\]; found \['something'\]"
-    ):
-        load_arrays(ImportPushTConfig(source=tmp_path / "foreign.npz", root=tmp_path / "data"))
+
+
+def test_unknown_variant_is_refused_with_the_known_ones(source, tmp_path, monkeypatch, capsys):
+    argv = ["command", f"--source={source}", f"--root={tmp_path / 'data'}", "--variant=pixels"]
+    monkeypatch.setattr(sys, "argv", argv)
+    with pytest.raises(SystemExit):
+        command.main()
+    error = capsys.readouterr().err
+    assert all(word in error for word in ("--variant", "pixels", "keypoints", "state", "image"))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda a: {"something": np.zeros(3)}, r"no array \['state', 'action', 'episode_ends', 'img'\]"),
+        (lambda a: {k: v for k, v in a.items() if k != "episode_ends"}, r"no array \['episode_ends'\]"),
+        (lambda a: {**a, "episode_ends": np.array([3, 3, 9])}, "episode_ends must rise"),
+        (lambda a: {**a, "episode_ends": np.array([4, 3, 9])}, "episode_ends must rise"),
+        (lambda a: {**a, "episode_ends": np.array([0, 3, 9])}, "episode_ends must rise"),
+        (lambda a: {**a, "episode_ends": np.array([3, 4, 12])}, "episode_ends reaches row 12, .* have 9"),
+        (lambda a: {**a, "episode_ends": np.array([3.0, 9.0])}, "episode_ends must be row numbers"),
+        (lambda a: {**a, "episode_ends": np.array([], dtype=int)}, "episode_ends must be row numbers"),
+        (lambda a: {**a, "action": a["action"][:5]}, r"action has shape \(5, 2\), expected \(9, 2\)"),
+        (lambda a: {**a, "state": np.where(a["state"] == a["state"][4, 1], np.nan, a["state"])}, "state .* row 4"),
+        (lambda a: {**a, "img": a["img"][:, :, :, 0]}, "img must be images"),
+        (lambda a: {**a, "img": a["img"] * 2.0}, r"img must lie in \[0, 1\] or \[0, 255\]"),
+        (lambda a: {**a, "img": a["img"] / 255.0 - 0.5}, "img must lie in"),
+        (lambda a: {**a, "img": a["img"] * np.nan}, "img must lie in"),
+    ],
+)  # fmt: skip
+def test_arrays_that_do_not_fit_are_named(source, tmp_path, change, message):
+    with np.load(source) as arrays:
+        changed = change(dict(arrays))
+    path = tmp_path / "changed.npz"
+    np.savez(path, **changed)
+    with pytest.raises(ValueError, match=message) as raised:
+        import_pusht(ImportPushTConfig(source=path, root=tmp_path / "data", variant="image"))
+    assert str(path) in str(raised.value)
+    assert not list(tmp_path.glob("data*"))
+
+
+@pytest.mark.parametrize("scale", [1, 1 / 255], ids=["in [0, 255]", "in [0, 1]"])
+def test_images_may_be_floats(source, tmp_path, scale):
+    with np.load(source) as arrays:
+        path = tmp_path / "float.npz"
+        np.savez(path, **{**arrays, "img": (arrays["img"] * scale).astype(np.float32)})
+        np.testing.assert_array_equal(load_arrays(path, with_images=True)["img"], arrays["img"])
+
+
+def test_what_is_no_npz_file_is_refused(tmp_path):
+    path = tmp_path / "text.npz"
+    path.write_text("not an archive")
+    with pytest.raises(ValueError, match="text.npz"):
+        load_arrays(path)
 
 
 @pytest.mark.skipif(not REAL.exists(), reason="the human recordings are not at hand")

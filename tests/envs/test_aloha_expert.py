@@ -47,12 +47,14 @@ def episode(env) -> list[dict]:
     return observations
 
 
-def test_expert_succeeds_within_a_third_of_the_time(env):
-    outcomes = [play(env, EXPERT, seed) for seed in range(10)]
-    assert sum(success for _, success in outcomes) >= 9
+@pytest.mark.parametrize("n_episodes", [2, pytest.param(10, marks=pytest.mark.slow)])
+def test_expert_succeeds_within_a_third_of_the_time(env, n_episodes):
+    outcomes = [play(env, EXPERT, seed) for seed in range(n_episodes)]
+    assert sum(success for _, success in outcomes) >= 0.9 * n_episodes
     assert max(len(observations) for observations, _ in outcomes) < 134
 
 
+@pytest.mark.slow
 def test_expert_recovers_from_noise_on_the_joint_targets(env):
     rng = np.random.default_rng(0)
 
@@ -62,6 +64,7 @@ def test_expert_recovers_from_noise_on_the_joint_targets(env):
     assert sum(play(env, shaken, seed)[1] for seed in range(5)) >= 4
 
 
+@pytest.mark.slow
 def test_expert_finds_a_cube_that_was_taken_from_its_hand_and_turned(env):
     physics = env.unwrapped._env.physics
     rng = np.random.default_rng(1)

@@ -47,9 +47,10 @@ def play(env, expert, seed: int, noise: float = 0.0) -> tuple[np.ndarray, list[b
 def test_expert_ends_at_the_goal(task):
     pytest.importorskip("gymnasium_robotics")
     env = GymnasiumRoboticsEnv(task=task).make_single()
-    assert [seed for seed in range(10) if not play(env, EXPERTS[task], seed)[1][-1]] == []
+    assert [seed for seed in range(5) if not play(env, EXPERTS[task], seed)[1][-1]] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", EXPERTS)
 def test_expert_recovers_from_disturbances(task):
     pytest.importorskip("gymnasium_robotics")
@@ -61,7 +62,7 @@ def test_expert_recovers_from_disturbances(task):
 def test_pick_and_place_opens_and_closes_once_and_then_holds():
     pytest.importorskip("gymnasium_robotics")
     env = GymnasiumRoboticsEnv(task="FetchPickAndPlace-v4").make_single()
-    for seed in range(5):
+    for seed in range(2):
         actions, _ = play(env, fetch_pick_and_place_expert, seed)
         assert (np.diff(np.sign(actions[:, 3])) != 0).sum() == 1
         assert np.abs(np.diff(actions[30:], axis=0)).max() < 0.1  # at rest by then

@@ -76,17 +76,17 @@ def test_every_detour_still_leads_forward(skill, heading, hand):
 
 def test_tremor_has_the_stated_size_and_correlation(monkeypatch):
     monkeypatch.setattr("lerobot_agpd.envs.operators.SLIP_RATE", 0.0)
-    tremor = actions_of(STILL, 0.5, 20_000)[:, :3].astype(float)
+    tremor = actions_of(STILL, 0.5, 8_000)[:, :3].astype(float)
     assert tremor.mean() == pytest.approx(0, abs=0.01)
     assert tremor.std() == pytest.approx(TREMOR / 2, rel=0.03)
     lagged = (tremor[1:] * tremor[:-1]).mean() / tremor.var()
     assert lagged == pytest.approx(TREMOR_CORRELATION, abs=0.03)
 
 
-def test_pauses_stop_the_motion_for_the_stated_share_of_the_time(monkeypatch):
+def test_pauses_stop_the_motion_for_the_stated_fraction_of_the_time(monkeypatch):
     monkeypatch.setattr("lerobot_agpd.envs.operators.SLIP_RATE", 0.0)
     monkeypatch.setattr("lerobot_agpd.envs.operators.TREMOR", 0.0)
-    actions = actions_of(FORWARD, 0.0, 20_000)
+    actions = actions_of(FORWARD, 0.0, 8_000)
     paused = np.all(actions[:, :3] == 0, axis=1)
     np.testing.assert_allclose(actions[:, 3], FORWARD[3])  # the fingers hold on
     np.testing.assert_allclose(actions[~paused, 0], (1 - SLOWNESS) * FORWARD[0], rtol=1e-6)
@@ -98,7 +98,7 @@ def test_pauses_stop_the_motion_for_the_stated_share_of_the_time(monkeypatch):
 def test_slips_move_the_hand_off_and_reverse_the_gripper(monkeypatch):
     monkeypatch.setattr("lerobot_agpd.envs.operators.TREMOR", 0.0)
     monkeypatch.setattr("lerobot_agpd.envs.operators.PAUSE_RATE", 0.0)
-    actions = actions_of(FORWARD, 0.0, 20_000)
+    actions = actions_of(FORWARD, 0.0, 8_000)
     slipping = actions[:, 3] < 0
     np.testing.assert_allclose(actions[slipping, 3], -FORWARD[3])
     np.testing.assert_allclose(np.linalg.norm(actions[slipping, :3], axis=1), 1, rtol=1e-5)
@@ -112,6 +112,7 @@ def test_impossible_skill_is_refused(skill):
         Operator(Expert(lambda observation: STILL), skill, np.random.default_rng(0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", EXPERTS)
 def test_less_skill_succeeds_less_often_but_not_never(task):
     pytest.importorskip("gymnasium_robotics")

@@ -15,7 +15,7 @@ pytest.importorskip("robosuite")
 
 from lerobot_agpd.envs.robosuite_sim import RobosuiteEnv, View  # noqa: E402
 
-ALL_TASKS = [pytest.param(t, marks=() if t in ("lift", "can") else pytest.mark.slow) for t in TASKS]
+ALL_TASKS = [pytest.param(t, marks=() if t == "lift" else pytest.mark.slow) for t in TASKS]
 
 
 @pytest.fixture(scope="module")
@@ -239,6 +239,7 @@ def test_images_are_robosuites_turned_the_right_way_up(rendering):
     env.close()
 
 
+@pytest.mark.slow
 def test_space_of_the_images():
     env = RobosuiteEnv("lift", View("pixels", ("sideview",), (24, 32)))
     assert isinstance(env.observation_space[PIXELS], gym.spaces.Dict)

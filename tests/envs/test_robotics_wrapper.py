@@ -77,6 +77,7 @@ def test_two_environments_do_not_draw_into_each_others_images(make):
     np.testing.assert_array_equal(first.reset(seed=1)[0][PIXELS], alone)
 
 
+@pytest.mark.slow
 def test_shadows_can_be_left_out(make):
     bright = make(obs_type="pixels", task="AdroitHandDoor-v1", shadows=False).reset(seed=0)[0][PIXELS]
     dark = make(obs_type="pixels", task="AdroitHandDoor-v1").reset(seed=0)[0][PIXELS]

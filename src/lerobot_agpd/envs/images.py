@@ -25,7 +25,7 @@ def read_images(array: Any, name: str) -> np.ndarray:
         raise ValueError(f"{name} must be images (N, height, width, 3), found the shape {tuple(array.shape)}")
     if array.dtype == np.uint8:
         return np.asarray(array[:])
-    blocks = [slice(start, start + ROWS_PER_BLOCK) for start in range(0, len(array), ROWS_PER_BLOCK)]
+    blocks = [slice(start, start + ROWS_PER_BLOCK) for start in range(0, array.shape[0], ROWS_PER_BLOCK)]
     low = min((float(np.min(array[block])) for block in blocks), default=0.0)
     high = max((float(np.max(array[block])) for block in blocks), default=0.0)
     if not (low >= 0 and high <= 255):  # NaN is in no range

@@ -48,11 +48,10 @@ def load_arrays(source: Path, with_images: bool = False, images: Path | None = N
 
 
 def _load_npz(path: Path, names: Iterable[str]) -> Arrays:
-    try:
-        with np.load(path) as archive:
-            return _read(archive, {name: name for name in names}, str(path))
-    except (OSError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path} cannot be read as an .npz file: {error}") from error
+    if not zipfile.is_zipfile(path):
+        raise ValueError(f"{path} is not an .npz file")
+    with np.load(path) as archive:
+        return _read(archive, {name: name for name in names}, str(path))
 
 
 def _load_zarr(path: Path, names: Iterable[str]) -> Arrays:

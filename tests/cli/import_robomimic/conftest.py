@@ -1,4 +1,4 @@
-"""Files of real robosuite rollouts, and one of them imported."""
+"""Files of robomimic's schema, and one of them imported."""
 
 import sys
 from pathlib import Path
@@ -11,15 +11,11 @@ from lerobot_agpd.cli import import_robomimic as command
 
 @pytest.fixture(scope="session")
 def rollouts() -> list:
-    """Two demonstrations that lift the cube, and two too short for it."""
+    """Four demonstrations of random numbers, two of which succeed."""
     pytest.importorskip("h5py")
-    pytest.importorskip("robosuite")
-    from robomimic_files import LENGTHS, make_lift, record
+    from robomimic_files import LENGTHS, random_rollout
 
-    env = make_lift()
-    played = [record(env, seed, n_steps) for seed, n_steps in enumerate(LENGTHS)]
-    env.close()
-    return played
+    return [random_rollout(i, length, success=i < 2) for i, length in enumerate(LENGTHS)]
 
 
 @pytest.fixture(scope="session")
@@ -41,14 +37,10 @@ def imported(source, tmp_path_factory) -> LeRobotDataset:
 
 
 @pytest.fixture(scope="session")
-def images(rendering, tmp_path_factory) -> tuple[Path, list]:
+def images(tmp_path_factory) -> tuple[Path, list]:
     """Two demonstrations of two steps, seen by two cameras of 64 pixels."""
     pytest.importorskip("h5py")
-    pytest.importorskip("robosuite")
-    from robomimic_files import make_lift, part, record, write
+    from robomimic_files import random_rollout, write
 
-    env = make_lift(cameras=("agentview", "robot0_eye_in_hand"), size=64)
-    rollout = record(env, 0, 4)
-    env.close()
-    played = [part(rollout, 0, 2), part(rollout, 2, 4)]
+    played = [random_rollout(i, 2, True, ("agentview", "robot0_eye_in_hand")) for i in range(2)]
     return write(tmp_path_factory.mktemp("images") / "image_v15.hdf5", played), played

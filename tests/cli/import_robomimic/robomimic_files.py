@@ -1,4 +1,4 @@
-"""Makes robomimic files of real rollouts: robosuite's lift, a scripted arm, the schema of robomimic's own scripts."""
+"""Makes files in the schema of robomimic's own scripts: of random numbers, or of real rollouts of robosuite's lift."""
 
 import json
 from dataclasses import dataclass
@@ -10,8 +10,16 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_agpd.cli.import_robomimic import ImportRobomimicConfig, import_robomimic
 
-LENGTHS = (48, 47, 6, 5)
-"""Steps of the demonstrations that the tests share."""
+LENGTHS = (8, 7, 6, 5)
+"""Steps of the demonstrations that the tests share; the first two succeed."""
+
+OBSERVED = {
+    "robot0_eef_pos": 3,
+    "robot0_eef_quat": 4,
+    "robot0_gripper_qpos": 2,
+    "robot0_joint_pos": 7,
+    "object": 10,
+}
 
 OSC_POSE = {
     "type": "OSC_POSE",
@@ -75,24 +83,35 @@ class Rollout:
     attributes: dict[str, str]
 
 
-def make_lift(cameras: tuple[str, ...] = (), size: int = 84):
+def random_rollout(seed: int, length: int, success: bool, cameras: tuple[str, ...] = ()) -> Rollout:
+    """A demonstration of lift with random numbers, and images of 64 pixels."""
+    rng = np.random.default_rng(seed)
+    observed = {key: rng.normal(size=(length + 1, dim)) for key, dim in OBSERVED.items()}
+    observed["object"][:, 7:] = observed["object"][:, :3] - observed["robot0_eef_pos"]  # from hand to cube
+    images = (length + 1, 64, 64, 3)
+    observed |= {f"{camera}_image": rng.integers(0, 256, images, dtype=np.uint8) for camera in cameras}
+    is_last = np.arange(length) == length - 1
+    arrays = {"actions": rng.uniform(-1, 1, (length, 7)), "states": rng.normal(size=(length, 32))}
+    arrays |= {"rewards": 1.0 * (is_last & success), "dones": is_last.astype(int)}
+    return Rollout(
+        arrays,
+        obs={key: values[:-1] for key, values in observed.items()},
+        next_obs={key: values[1:] for key, values in observed.items()},
+        attributes={"model_file": f'<mujoco model="{seed}"/>', "ep_meta": "{}"},
+    )
+
+
+def make_lift():
     import robosuite
 
-    kwargs = {**ENV_ARGS["1.5.1"]["env_kwargs"]}
-    if cameras:
-        kwargs |= {"has_offscreen_renderer": True, "use_camera_obs": True, "camera_names": list(cameras)}
-        kwargs |= {"camera_heights": size, "camera_widths": size}
-    return robosuite.make("Lift", **kwargs)
+    return robosuite.make("Lift", **ENV_ARGS["1.5.1"]["env_kwargs"])
 
 
 def observe(env) -> dict[str, np.ndarray]:
-    """Observations under robomimic's names: arms, `object`, images the right way up."""
+    """Observations under robomimic's names: the arm's and `object`."""
     raw = env._get_observations(force_update=True)
-    obs = {
-        key: raw[key] for key in raw if key.startswith("robot0_") and not key.endswith(("-state", "_image"))
-    }
-    images = {key: raw[key][::-1] for key in raw if key.endswith("_image")}
-    return {key: np.array(value) for key, value in (obs | images | {"object": raw["object-state"]}).items()}
+    arm = {key: raw[key] for key in raw if key.startswith("robot0_") and not key.endswith("-state")}
+    return {key: np.array(value) for key, value in (arm | {"object": raw["object-state"]}).items()}
 
 
 def reach_grasp_lift(obs: dict[str, np.ndarray], step: int, rng: np.random.Generator) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""`lerobot-agpd-import-robomimic` on files of real robosuite rollouts: what is imported."""
+"""`lerobot-agpd-import-robomimic`: what is imported."""
 
 import json
 import logging
@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 h5py = pytest.importorskip("h5py")
-pytest.importorskip("robosuite")
 
 from lerobot.utils.feature_utils import dataset_to_policy_features  # noqa: E402
 from robomimic_files import ENV_ARGS, LENGTHS, Rollout, column, run_import, write  # noqa: E402
@@ -98,31 +97,6 @@ def test_recordings_are_a_raw_robomimic_file(imported):
             file.observation_shapes("demo_0")
 
 
-def test_recorded_actions_replayed_reproduce_the_recording(imported):
-    from lerobot_agpd.envs.robosuite_sim import RobosuiteEnv
-
-    recording = load_recording(imported.root, "demo_1")
-    env = RobosuiteEnv("lift")
-    observation, _ = env.reset_to(recording.states[0], recording.model_xml)
-    states, successes, observations = [], [], []
-    for action in recording.actions:
-        states.append(env.get_state())
-        observations.append(observation)
-        observation, *_, info = env.step(action)
-        successes.append(info["is_success"])
-    env.close()
-    np.testing.assert_allclose(states, recording.states, atol=1e-3)
-    positions = slice(1, 17)  # after the time: seven joints, two fingers, the cube's position and quaternion
-    np.testing.assert_allclose(np.array(states)[:, positions], recording.states[:, positions], atol=1e-4)
-    assert successes == column(imported, "next.success", 1).ravel().tolist() and successes[-1]
-    for raw, key in (
-        ("agent_pos", "observation.state"),
-        ("environment_state", "observation.environment_state"),
-    ):
-        shown = np.stack([seen[raw] for seen in observations])
-        np.testing.assert_allclose(shown, column(imported, key, 1), atol=1e-4)
-
-
 # ---- which episodes ----
 
 
@@ -132,7 +106,7 @@ def test_episodes_count_numerically(rollouts, tmp_path):
     dataset = run_import(source, tmp_path / "data", episodes=[3, 0])
     report = json.loads((dataset.root / "meta/robomimic.json").read_text())
     assert [row["demo"] for row in report["episodes"]] == ["demo_10", "demo_0"]
-    assert [column(dataset, "action", episode).shape[0] for episode in (0, 1)] == [48, 6]
+    assert [column(dataset, "action", episode).shape[0] for episode in (0, 1)] == [8, 6]
 
 
 def test_masks_choose_and_name_operators(rollouts, tmp_path):
@@ -155,6 +129,33 @@ def test_masks_choose_and_name_operators(rollouts, tmp_path):
     ]
     assert report["masks"] == masks
     assert "operator" not in dataset_to_policy_features(dataset.features)  # no policy reads it
+
+
+# ---- files with less or more than robomimic's ----
+
+
+def without(rollout, *keys):
+    return replace(rollout, arrays={key: values for key, values in rollout.arrays.items() if key not in keys})
+
+
+def test_rewards_and_dones_may_be_missing(rollouts, tmp_path, caplog):
+    source = write(
+        tmp_path / "generated.hdf5", [without(rollout, "rewards", "dones") for rollout in rollouts[2:]]
+    )
+    with caplog.at_level(logging.WARNING):
+        dataset = run_import(source, tmp_path / "data")
+    assert "rewards" in caplog.text and "dones" in caplog.text
+    assert (dataset.num_episodes, dataset.num_frames) == (2, 11)
+    assert not {"next.reward", "next.success", "next.done"} & set(dataset.features)
+    recording = load_recording(dataset.root, "demo_0")
+    assert recording.rewards is None and recording.dones is None
+
+
+def test_dones_alone_may_be_missing(rollouts, tmp_path):
+    source = write(tmp_path / "generated.hdf5", [without(rollouts[1], "dones")])
+    dataset = run_import(source, tmp_path / "data")
+    assert "next.done" not in dataset.features
+    assert column(dataset, "next.success", 0).ravel().tolist() == [False] * 6 + [True]
 
 
 # ---- files of robosuite 1.4.1 ----
@@ -183,7 +184,9 @@ def test_files_of_141_get_todays_order(name, tmp_path):
     arrays |= {"rewards": np.zeros(2), "dones": np.array([0, 1])}
     source = write(tmp_path / "v141.hdf5", [Rollout(arrays, obs, obs, {})], version="1.4.1")
     with h5py.File(source, "a") as file:
-        file["data"].attrs["env_args"] = json.dumps({**ENV_ARGS["1.4.1"], "env_name": task.robosuite_name})
+        kwargs = {**ENV_ARGS["1.4.1"]["env_kwargs"], "robots": ["Panda"] * task.n_robots}
+        env_args = {**ENV_ARGS["1.4.1"], "env_name": task.robosuite_name, "env_kwargs": kwargs}
+        file["data"].attrs["env_args"] = json.dumps(env_args)
     dataset = run_import(source, tmp_path / "data")
     expected = np.concatenate([numbers[key] for key in task.object_keys], axis=1)
     np.testing.assert_array_equal(column(dataset, "observation.environment_state", 0), expected)
@@ -209,12 +212,27 @@ def test_one_camera_beside_the_objects_state(images, tmp_path):
     assert dataset.features["observation.environment_state"]["shape"] == (10,)
 
 
+def test_images_as_floats_are_the_same(images, tmp_path):
+    source, played = images
+    key = "agentview_image"
+    floats = [replace(p, obs={**p.obs, key: p.obs[key].astype(np.float32) / 255}) for p in played]
+    source = write(tmp_path / "float.hdf5", floats)
+    dataset = run_import(source, tmp_path / "data", images=True, cameras=["agentview"], episodes=[0])
+    for index, frame in enumerate(dataset):
+        shown = (frame["observation.images.agentview"] * 255).round().permute(1, 2, 0).numpy()
+        np.testing.assert_array_equal(shown, played[0].obs[key][index])
+
+
 @pytest.mark.slow
 def test_video_is_nearly_the_same(images, tmp_path):
-    source, played = images
-    dataset = run_import(source, tmp_path / "data", images=True, video=True, episodes_per_shard=1)
+    _, played = images
+    smooth = np.linspace(0, 255, 64 * 64 * 3).reshape(1, 64, 64, 3).astype(np.uint8).repeat(2, axis=0)
+    source = write(
+        tmp_path / "smooth.hdf5", [replace(p, obs={**p.obs, "agentview_image": smooth}) for p in played]
+    )
+    options = {"images": True, "video": True, "cameras": ["agentview"], "episodes_per_shard": 1}
+    dataset = run_import(source, tmp_path / "data", **options)
     assert dataset.meta.video_keys
     for index in range(len(dataset)):
         shown = dataset[index]["observation.images.agentview"].permute(1, 2, 0).numpy()
-        original = played[index // 2].obs["agentview_image"][index % 2] / 255
-        assert np.abs(shown - original).mean() < 0.03
+        assert np.abs(shown - smooth[0] / 255).mean() < 0.03

@@ -1,6 +1,5 @@
 """Imports of robomimic's files that are killed go on where they were."""
 
-import shutil
 import signal
 import subprocess
 import sys
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 
 pytest.importorskip("h5py")
-pytest.importorskip("robosuite")
 
 from lerobot.datasets.lerobot_dataset import LeRobotDataset  # noqa: E402
 from robomimic_files import column, part, run_import, write  # noqa: E402
@@ -45,9 +43,7 @@ def test_killed_import_goes_on(rollouts, imported, tmp_path):
     with pytest.MonkeyPatch.context() as patch:
         create = LeRobotDataset.create
         patch.setattr(
-            command.LeRobotDataset,
-            "create",
-            lambda *args, **kwargs: rewritten.append(0) or create(*args, **kwargs),
+            LeRobotDataset, "create", lambda *args, **kwargs: rewritten.append(0) or create(*args, **kwargs)
         )
         dataset = run_import(source, root, episodes_per_shard=2)
     assert len(rewritten) == 20 - len(finished)
@@ -82,29 +78,30 @@ def test_interrupted_import_goes_on(source, rollouts, tmp_path, monkeypatch):
         np.testing.assert_array_equal(column(dataset, "action", episode), expected)
 
 
+@pytest.mark.slow
 def test_import_killed_while_merging_goes_on(source, tmp_path, monkeypatch):
     def die(*args, **kwargs):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(command, "copy_recordings", die)
     with pytest.raises(KeyboardInterrupt):
-        run_import(source, tmp_path / "data")
+        run_import(source, tmp_path / "data", episodes_per_shard=2)
     assert (tmp_path / "data.partial/merged").exists() and not (tmp_path / "data").exists()
     monkeypatch.undo()
-    assert run_import(source, tmp_path / "data").num_episodes == 4
+    monkeypatch.setattr(RobomimicColumns, "read", die)  # nothing is read again
+    assert run_import(source, tmp_path / "data", episodes_per_shard=2).num_episodes == 4
 
 
 def test_another_file_or_option_does_not_continue(source, rollouts, tmp_path, monkeypatch):
-    monkeypatch.setattr(command.ShardedWriter, "write", lambda *args: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
+    def die(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(RobomimicColumns, "read", die)
+    with pytest.raises(KeyboardInterrupt):
         run_import(source, tmp_path / "data", episodes=[0, 1])
     monkeypatch.undo()
-    with pytest.raises(FileExistsError, match=r"other options \(demos was .*'demo_1'\], is now .*'demo_2'\]"):
+    with pytest.raises(FileExistsError, match=r"demos was .*'demo_1'\], is now .*'demo_2'\]"):
         run_import(source, tmp_path / "data", episodes=[0, 2])
     other = write(tmp_path / "other.hdf5", rollouts[2:])
-    with pytest.raises(FileExistsError, match=r"other options \(source was"):
+    with pytest.raises(FileExistsError, match="source was"):
         run_import(other, tmp_path / "data", episodes=[0, 1])
-    shutil.rmtree(tmp_path / "data.partial")
-    (tmp_path / "data.partial").mkdir()
-    with pytest.raises(FileExistsError, match="no unfinished import"):
-        run_import(source, tmp_path / "data")

@@ -1,6 +1,7 @@
 """Files and options that the import of robomimic's data refuses, and what it says."""
 
 import json
+import logging
 import sys
 from pathlib import Path
 
@@ -8,9 +9,8 @@ import numpy as np
 import pytest
 
 h5py = pytest.importorskip("h5py")
-pytest.importorskip("robosuite")
 
-from robomimic_files import ENV_ARGS, part, run_import, write  # noqa: E402
+from robomimic_files import ENV_ARGS, RIGHT_ARM, V141, part, run_import, write  # noqa: E402
 
 from lerobot_agpd.cli import import_robomimic as command  # noqa: E402
 from lerobot_agpd.cli.import_robomimic import ImportRobomimicConfig  # noqa: E402
@@ -47,6 +47,15 @@ def with_env_args(**changes):
     return apply
 
 
+def with_env_kwargs(**changes):
+    return with_env_args(env_kwargs={**ENV_ARGS["1.5.1"]["env_kwargs"], **changes})
+
+
+def with_controller(**changes):
+    controller = {"type": "BASIC", "body_parts": {"right": {**RIGHT_ARM, **changes}}}
+    return with_env_kwargs(controller_configs=controller)
+
+
 def with_nan(values):
     values[2, 1] = np.nan
     return values
@@ -59,6 +68,13 @@ def with_nan(values):
         (lambda file: file["data"].attrs.pop("env_args"), r"attribute env_args; found .*\['total'\]"),
         (with_env_args(env_name="Stack"), "env_name must be one of Lift, PickPlaceCan, .* found 'Stack'"),
         (with_env_args(env_kwargs={}), "control_freq must be a positive number, found None"),
+        (with_env_kwargs(control_freq=10), r"control_freq 10 \(expected 20\)"),
+        (with_env_kwargs(robots=["Sawyer"]), r"robots \['Sawyer'\]"),
+        (with_controller(type="JOINT_POSITION"), "controller type JOINT_POSITION"),
+        (with_controller(input_type="absolute"), "controller input_type absolute"),
+        (with_controller(input_ref_frame="base"), "controller input_ref_frame base"),
+        (with_controller(output_max=0.1), "controller output_max 0.1"),
+        (with_env_kwargs(controller_configs={**V141, "control_delta": False}), "controller input_type absolute"),
         (spoil("data/demo_1/actions", lambda x: x[:2]), r"demo_1/actions has shape \(2, 7\), expected \(3, 7\)"),
         (spoil("data/demo_1/obs/object", lambda x: x[:, :9]), r"demo_1/obs/object has shape \(3, 9\)"),
         (spoil("data/demo_0/states", lambda x: x[:1]), "demo_0/states has 1 rows, expected 3"),
@@ -75,7 +91,14 @@ def test_spoilt_files_are_named(edited, tmp_path, change, message):
     with pytest.raises(ValueError, match=message) as raised:
         run_import(path, tmp_path / "data")
     assert str(path) in str(raised.value)
-    assert not (tmp_path / "data").exists()
+    assert not list(tmp_path.glob("data*"))
+
+
+def test_a_file_that_does_not_tell_its_controller_is_taken_with_a_warning(edited, tmp_path, caplog):
+    path = edited(with_env_kwargs(controller_configs=None))
+    with caplog.at_level(logging.WARNING):
+        run_import(path, tmp_path / "data")
+    assert "OSC_POSE is assumed" in caplog.text
 
 
 def test_raw_files_need_observations_first(rollouts, tmp_path):
@@ -98,13 +121,16 @@ def test_what_is_no_hdf5_file_or_half_of_one(source, tmp_path):
 
 
 def test_what_the_file_does_not_have_is_listed(source, rollouts, tmp_path):
-    masked = write(tmp_path / "masked.hdf5", rollouts[2:], masks={"train": ["demo_0"], "valid": ["demo_7"]})
+    masked = write(
+        tmp_path / "masked.hdf5", rollouts[2:], masks={"train": ["demo_0"], "valid": ["demo_7"], "none": []}
+    )
     for path, options, message in (
         (source, {"episodes": [0, 4]}, r"--episodes=\[4\]: .* has 4 demonstrations, 0 to 3"),
         (source, {"episodes": [-1]}, r"--episodes=\[-1\]"),
         (source, {"filter_key": "train"}, "--filter_key=train: .* has the masks none"),
-        (masked, {"filter_key": "20_percent"}, r"has the masks \['train', 'valid'\]"),
+        (masked, {"filter_key": "20_percent"}, r"has the masks \['none', 'train', 'valid'\]"),
         (masked, {"filter_key": "valid"}, r"--filter_key=valid names \['demo_7'\]"),
+        (masked, {"filter_key": "none"}, "--filter_key=none: .* selects no demonstration"),
         (source, {"images": True}, r"no observations named <camera>_image; found \['object'"),
     ):
         with pytest.raises(ValueError, match=message):
