@@ -24,7 +24,7 @@ from lerobot_agpd.studies.latency import random_observations
 logger = logging.getLogger(__name__)
 
 TOLERANCE = 1e-6
-"""Largest difference between the two policies' normalised actions."""
+"""Largest difference between the two policies' normalized actions."""
 
 
 @dataclass
@@ -83,7 +83,7 @@ def _as(
 
 
 def largest_difference(policy: PreTrainedPolicy, plain: PreTrainedPolicy, batch_size: int = 8) -> float:
-    """Largest difference of the two policies' chunks at random normalised observations, from the same noise."""
+    """Largest difference of the two policies' chunks at random normalized observations, from the same noise."""
     observations = random_observations(policy, batch_size)
     chunks = []
     for each in (policy, plain):

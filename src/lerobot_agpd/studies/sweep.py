@@ -47,7 +47,7 @@ class SweepRow:
         success: rate among the episodes that were not solved at the start.
         kept: number of kept episodes.
         actions: `action_diagnostics` at the same observations for all settings.
-        entropy: nearest-neighbour entropy of the states of all episodes, in nats, equal numbers of states for all.
+        entropy: nearest-neighbor entropy of the states of all episodes, in nats, equal numbers of states for all.
         entropy_kept: the same of the kept episodes; None, as above, for too few states.
         coverage: fraction of the student's own states with a state of a kept episode within epsilon.
     """
@@ -149,7 +149,7 @@ class Sweep:
         )
 
     def states(self, episodes: Sequence[Episode]) -> Array:
-        """Standardised states of episodes, (N, D)."""
+        """Standardized states of episodes, (N, D)."""
         return np.concatenate([state_path(episode, self.stats) for episode in episodes])
 
     def entropy(self, states: Array) -> float | None:
