@@ -51,4 +51,5 @@ def test_reports_and_sweeps_are_read():
     assert len(rounds_table(agpd.rounds)) == 1 + len(agpd.rounds) == 6
     assert 0 < tally_rate([round_["tallies"]["strategy"] for round_ in agpd.rounds]) <= 1
     rows = committed.read_sweep(BENCHMARKS / "diversity/fetchpush/sweep.json")
-    assert {row["setting"]["strategy"] for row in rows} == set(NAMES)
+    strategies = {row["setting"]["strategy"] for row in rows}
+    assert "teacher" in strategies and strategies <= set(NAMES)

@@ -71,4 +71,8 @@ def _parse[C](config_class: type[C], args: list[str]) -> C:
         sys.exit(0)
     path_fields = getattr(config_class, "__get_path_fields__", list)()
     args = parser.filter_path_args(path_fields, args)
-    return draccus.parse(config_class=config_class, args=args)
+    config_path = parser.parse_arg("config_path", args)
+    if config_path:
+        config_path = parser.extract_path_fields_from_config(config_path, path_fields)
+        args = parser.filter_arg("config_path", args)
+    return draccus.parse(config_class=config_class, config_path=config_path, args=args)
