@@ -49,6 +49,13 @@ def test_one_line(name, monkeypatch, tmp_path):
     assert not list(tmp_path.iterdir()), "nothing was begun"
 
 
+def test_flags_and_the_checkpoint_may_come_from_a_file(monkeypatch, tmp_path):
+    path = tmp_path / "flags.yaml"
+    path.write_text(f"{{env: {{type: pusht}}, policy: {{path: {tmp_path / 'nowhere'}}}}}")
+    with pytest.raises(SystemExit, match="lerobot-agpd-viz: .*nowhere"):
+        main("viz", monkeypatch, f"--config_path={path}")()
+
+
 @pytest.fixture
 def plugin(monkeypatch, tmp_path, request) -> str:
     """A package, not installed, that registers an environment type of its own name."""

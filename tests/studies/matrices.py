@@ -7,6 +7,8 @@ import yaml
 from lerobot_agpd.studies.evaluation import Evaluation
 from lerobot_agpd.studies.matrix import load_matrix
 
+MISSING = object()
+
 
 def content(tmp_path: Path) -> dict:
     for name in ("teacher", "demos"):
@@ -44,6 +46,8 @@ def changed(entries: dict, where: str, value) -> dict:
     for name in parents:
         inner = inner[name]
     inner[last] = value
+    if value is MISSING:
+        del inner[last]
     return entries
 
 

@@ -49,7 +49,7 @@ def test_entropy_of_scaled_states_grows_by_the_log_of_the_scale(scale, dim):
 
 
 def test_entropy_of_two_points_by_hand():
-    # digamma(2) - digamma(1) = 1, length of [-1, 1] = 2, both neighbours 0.5 away
+    # digamma(2) - digamma(1) = 1, length of [-1, 1] = 2, both neighbors 0.5 away
     assert knn_entropy([[0.0], [0.5]], k=1) == pytest.approx(1 + math.log(2) + math.log(0.5))
 
 

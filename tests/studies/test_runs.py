@@ -8,7 +8,7 @@ import draccus
 import pytest
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.utils import STATS_PATH
-from matrices import changed, content, load
+from matrices import MISSING, changed, content, load
 
 from lerobot_agpd.studies.matrix import flat, load_matrix
 from lerobot_agpd.studies.parsing import decode_environment, parse_train_flags
@@ -71,8 +71,8 @@ def test_a_part_of_the_matrix(tmp_path):
 @pytest.mark.parametrize(
     ("where", "value", "message"),
     [
-        ("sedes", [1], r"unknown entries \['sedes'\]"),
-        ("tasks.pusht.flag", {}, r"tasks.pusht: unknown entries \['flag'\]"),
+        ("sedes", [1], "sedes"),
+        ("tasks.pusht.flag", {}, "tasks.pusht.*flag"),
         ("tasks.pusht.measure", "reward", "tasks.pusht.*measure.*reward"),
         ("tasks.pusht.env", {"obs_type": "x"}, "env needs a type"),
         ("tasks.pusht.teacher", "", "method 'agpd' takes a teacher and tasks.pusht names none"),
@@ -80,11 +80,13 @@ def test_a_part_of_the_matrix(tmp_path):
         ("methods.agpd.flags", {"seed": 3}, "methods.agpd.flags sets 'seed'"),
         ("common.output_dir", "x", "common sets 'output_dir'"),
         ("seeds", [1, 1], "different training seeds"),
-        ("seeds", ["a"], "list of integers"),
+        ("seeds", ["a"], "seeds.*'a'"),
+        ("seeds", 3, "seeds.*3"),
         ("seeds", [100_000], r"training seeds lie in \[0, 100000\)"),
-        ("output", None, "output is missing"),
+        ("output", MISSING, "output"),
+        ("common", [1], "common"),
         ("references", ["dc"], r"references \['dc'\] are no methods"),
-        ("references", "bc", "references must be a list of methods"),
+        ("references", "bc", "references.*bc"),
         ("output", "${NOT_SET_ANYWHERE}/x", "NOT_SET_ANYWHERE"),
         ("evaluation.seed", 5, "leave the seeds that training and collection never use"),
         ("evaluation.curve_seed", 100_003, "overlap"),

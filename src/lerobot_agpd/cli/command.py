@@ -15,7 +15,7 @@ import draccus
 from draccus.utils import DraccusException
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.utils.import_utils import register_third_party_plugins
-from lerobot.utils.utils import has_method, init_logging
+from lerobot.utils.utils import init_logging
 
 from lerobot_agpd.studies.parsing import load_plugins, reason
 
@@ -70,9 +70,13 @@ def _parse[C](config_class: type[C], args: list[str]) -> C:
     if "--help" in args or "-h" in args:
         parser.print_scoped_help(config_class, args)
         sys.exit(0)
-    if has_method(config_class, "__get_path_fields__"):
-        args = parser.filter_path_args(config_class.__get_path_fields__(), args)
-    return draccus.parse(config_class=config_class, args=args)
+    path_fields = getattr(config_class, "__get_path_fields__", list)()
+    args = parser.filter_path_args(path_fields, args)
+    config_path = parser.parse_arg("config_path", args)
+    if config_path:
+        config_path = parser.extract_path_fields_from_config(config_path, path_fields)
+        args = parser.filter_arg("config_path", args)
+    return draccus.parse(config_class=config_class, config_path=config_path, args=args)
 
 
 def checkpoint_of_policy_flag() -> PreTrainedConfig | None:

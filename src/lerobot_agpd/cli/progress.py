@@ -1,4 +1,4 @@
-"""The progress bar of commands that write episodes."""
+"""A progress bar for commands that write episodes."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -8,10 +8,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 @contextmanager
 def episode_bar(description: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show a bar; yields a function that is told how many more episodes are done.
+    """Show a progress bar; yields a function that advances it by a number of episodes.
 
     Args:
-        description: what the bar is called.
+        description: shown beside the bar.
         total: number of episodes.
     """
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

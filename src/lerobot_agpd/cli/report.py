@@ -1,6 +1,7 @@
 """`lerobot-agpd-report`: evaluate runs side by side; a table, a picture and JSON."""
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -96,7 +97,8 @@ def report_run(name: str, run: Path, evaluator: Evaluator, config: ReportConfig)
 def report_policy(name: str, path: Path, evaluator: Evaluator, config: ReportConfig) -> list[Result]:
     """Evaluate one checkpoint, once for every number of steps that it is to execute per prediction."""
     results = []
-    for n_steps in config.n_action_steps or [None]:
+    numbers: Sequence[int | None] = config.n_action_steps or [None]
+    for n_steps in numbers:
         row = name if n_steps is None else f"{name}, {n_steps} step{'s' * (n_steps != 1)} per chunk"
         final = evaluator.evaluate(path, config.episodes, config.seed, n_steps)
         results.append(Result(name=row, finals={"last": final}, latency=evaluator.latency(path, n_steps)))

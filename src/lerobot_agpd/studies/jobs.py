@@ -127,21 +127,21 @@ async def _run_steps(job: Job, threads: int, lock: int, show: Callable[[str], No
                 env={**os.environ, "OMP_NUM_THREADS": str(threads)},
                 pass_fds=[lock],
             )
-            returncode = await _wait(process, lambda log=step.log: show(f"{job.name}  {activity(log)}"))  # type: ignore[misc]
+            returncode = await _wait(process, lambda text: show(f"{job.name}  {text}"), step.log)
         step.done(returncode)
         if returncode:
             return f"ended with {returncode}; the end of {step.log}:\n{_last_lines(step.log)}"
     return None
 
 
-async def _wait(process: asyncio.subprocess.Process, show: Callable[[], None]) -> int:
+async def _wait(process: asyncio.subprocess.Process, show: Callable[[str], None], log: Path) -> int:
     """Wait for a process, showing its progress; end it when canceled."""
     try:
         while True:
             try:
                 return await asyncio.wait_for(asyncio.shield(process.wait()), POLL)
             except TimeoutError:
-                show()
+                show(activity(log))
     finally:
         if process.returncode is None:
             process.terminate()

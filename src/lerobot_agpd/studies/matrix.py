@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from string import Template
 from typing import Any, Literal
@@ -123,8 +123,11 @@ class Matrix:
 
     tasks: dict[str, TaskEntry]
     methods: dict[str, MethodEntry]
+    # training seeds
     seeds: list[int]
+    # folder of the runs and the report
     output: Path
+    # flags of lerobot-train for all runs
     common: dict[str, Any] = field(default_factory=dict)
     evaluation: EvaluationEntry = field(default_factory=EvaluationEntry)
     # Methods that all are compared with; default: all.
@@ -175,25 +178,10 @@ def load_matrix(path: Path) -> Matrix:
         raise FileNotFoundError(f"--matrix={path}: no such file")
     try:
         content = _expand(yaml.safe_load(path.read_text()))
-        _check_names(content, Matrix)
-        entries = {
-            "tasks": _decode_all(content.get("tasks"), TaskEntry, "tasks"),
-            "methods": _decode_all(content.get("methods"), MethodEntry, "methods"),
-            "evaluation": _decode(content.get("evaluation") or {}, EvaluationEntry, "evaluation"),
-        }
-        seeds, common = content.get("seeds"), content.get("common") or {}
-        require(
-            isinstance(seeds, list) and all(type(seed) is int for seed in seeds),
-            f"seeds must be a list of integers, got {seeds}",
-        )
-        require(isinstance(common, dict), f"common must hold flags, got {common}")
-        require(bool(content.get("output")), "output is missing: the folder of the comparison")
-        references = content.get("references") or []
-        require(isinstance(references, list), f"references must be a list of methods, got {references}")
-        output = Path(content["output"])
-        return Matrix(**entries, seeds=seeds, output=output, common=common, references=references)
-    except (ValueError, yaml.YAMLError) as error:
-        raise ValueError(f"--matrix={path}: {error}") from error
+        require(isinstance(content, dict), f"expected tasks, methods, seeds and output, got {content}")
+        return draccus.decode(Matrix, content)
+    except (ValueError, ParsingError, yaml.YAMLError) as error:
+        raise ValueError(f"--matrix={path}: {reason(error)}") from error
 
 
 def flat(flags: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -217,23 +205,3 @@ def _expand(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _expand(entry) for key, entry in value.items()}
     return [_expand(entry) for entry in value] if isinstance(value, list) else value
-
-
-def _decode_all(entries: Any, kind: type, where: str) -> dict[str, Any]:
-    require(isinstance(entries, dict), f"{where} must name its entries, got {entries}")
-    return {str(name): _decode(entry or {}, kind, f"{where}.{name}") for name, entry in entries.items()}
-
-
-def _decode(entry: Any, kind: type, where: str) -> Any:
-    try:
-        _check_names(entry, kind)
-        return draccus.decode(kind, entry)
-    except (ValueError, ParsingError) as error:
-        raise ValueError(f"{where}: {reason(error)}") from error
-
-
-def _check_names(entry: Any, kind: type) -> None:
-    names = [field_.name for field_ in fields(kind)]
-    require(isinstance(entry, dict), f"expected entries {names}, got {entry}")
-    unknown = sorted(set(map(str, entry)) - set(names))
-    require(not unknown, f"unknown entries {unknown}; there are {names}")

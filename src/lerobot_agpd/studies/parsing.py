@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr
 from typing import Any
@@ -15,6 +16,8 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.envs import EnvConfig
 
 PLUGIN = parser.PLUGIN_DISCOVERY_SUFFIX
+WRAPPER = re.compile(r"Couldn't instantiate class \w+ using the given arguments\.?")
+"""draccus' words around the message of a `__post_init__`."""
 
 
 def reason(error: BaseException) -> str:
@@ -22,8 +25,8 @@ def reason(error: BaseException) -> str:
     first = error
     while first.__cause__ is not None:
         first = first.__cause__
-    text = str(error) if first is error else f"{error} {first}"
-    return " ".join(text.split())
+    text = str(error) if first is error or str(first) in str(error) else f"{error} {first}"
+    return " ".join(WRAPPER.sub("", text).split())
 
 
 def load_plugins(args: Sequence[str]) -> list[str]:

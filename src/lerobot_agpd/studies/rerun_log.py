@@ -98,8 +98,10 @@ def _log_decisions(stream: rr.RecordingStream, root: str, decisions: Sequence[De
             _log_series(stream, path, planned, chunks[:, [dim]], [LABELS[name]], [COLORS[name]])
     steps = np.array([d.step for d in decisions])
     discrepancy = np.array([[d.teacher_discrepancy, d.guided_discrepancy] for d in decisions])
-    labels, colors = ([names[key] for key in ("teacher", "guided")] for names in (LABELS, COLORS))
-    _log_series(stream, f"{root}/discrepancy", steps, discrepancy, labels, colors)
+    labels = [LABELS["teacher"], LABELS["guided"]]
+    _log_series(
+        stream, f"{root}/discrepancy", steps, discrepancy, labels, [COLORS["teacher"], COLORS["guided"]]
+    )
     shift = np.array([[d.guidance_shift] for d in decisions])
     _log_series(stream, f"{root}/guidance_shift", steps, shift, ["mean shift in sigmas"])
 

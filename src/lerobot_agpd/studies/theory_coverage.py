@@ -80,7 +80,7 @@ def coverage_probability(
         n: number of training states.
         dim: dimension of the state.
         sigma_test: standard deviation of the test states; None is the same as in training, as in Eq. 4.
-        offset: distance between the two centres.
+        offset: distance between the two centers.
     """
     sigma_test = sigma if sigma_test is None else sigma_test
     nodes, weights = roots_legendre(200)

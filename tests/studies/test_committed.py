@@ -1,0 +1,55 @@
+"""Committed results, made under earlier names of flags and keys, as today's package reads them."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from lerobot_agpd.files import read_json
+from lerobot_agpd.studies.frontier import NAMES
+from lerobot_agpd.studies.results import tally_rate
+from lerobot_agpd.studies.tables import rounds_table
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+sys.path.append(str(BENCHMARKS))
+import committed  # noqa: E402
+
+TALLY = {"generated", "solved_at_start", "successful", "kept"}
+
+
+def test_flags_have_todays_names():
+    old = {"policy.collect.strategy": "replay", "policy.replay.collected_share": 0.5, "env.type": "robomimic"}
+    old |= {"policy.collect.unguided_fraction": 0.2, "policy.collect.mixing.relabel": True, "seed": 1000}
+    assert committed.flags(old) == {
+        "policy.collect.strategy": "teacher",
+        "policy.replay.collected_fraction": 0.5,
+        "env.type": "robosuite_robomimic",
+        "policy.collect.teacher_only_fraction": 0.2,
+        "policy.collect.mixing.record_teacher": True,
+        "seed": 1000,
+    }
+
+
+@pytest.mark.parametrize(
+    "task", sorted(BENCHMARKS.glob("comparison/results/*/*/")), ids=lambda path: path.name
+)
+def test_rounds_have_todays_keys(task):
+    for file in task.glob("*/*/run.json"):
+        content = read_json(file)
+        for old, new in zip(content["rounds"], committed.run(content)["rounds"], strict=True):
+            assert set(new["tallies"]) == {"strategy", "teacher_only", "retried", "student_alone"}
+            assert all(set(tally) == TALLY for tally in new["tallies"].values()) and set(new) >= TALLY
+            assert sum(new["tallies"][part]["generated"] for part in new["tallies"]) == new["generated"]
+            assert new["tallies"]["strategy"]["successful"] == old["guided"]["successful"]
+            assert new["strength"] == old["scale"] and committed.round_report(new) == new
+
+
+def test_reports_and_sweeps_are_read():
+    results = committed.read_report(BENCHMARKS / "quickstart/report.json")
+    (agpd,) = (result for result in results if result.rounds)
+    assert len(agpd.finals["last"].seeds) == len(agpd.finals["last"].successes) > 100
+    assert len(rounds_table(agpd.rounds)) == 1 + len(agpd.rounds) == 6
+    assert 0 < tally_rate([round_["tallies"]["strategy"] for round_ in agpd.rounds]) <= 1
+    rows = committed.read_sweep(BENCHMARKS / "diversity/fetchpush/sweep.json")
+    strategies = {row["setting"]["strategy"] for row in rows}
+    assert "teacher" in strategies and strategies <= set(NAMES)
