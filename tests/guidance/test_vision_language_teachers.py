@@ -4,6 +4,7 @@ import pytest
 import torch
 from tiny_policies import CAMERA, STATE, WITH_CAMERA, generator, history
 
+from lerobot_agpd.config import FlagError
 from lerobot_agpd.guidance import guide as guidance
 from lerobot_agpd.guidance.adapters.flow import MultiTaskDiTTeacher
 from lerobot_agpd.guidance.adapters.rtc import RTCTeacher
@@ -154,7 +155,7 @@ def test_a_diffusing_dit_can_exchange_its_scheduler(make, tmp_path, kind):
     teacher.set_sampler(5, "DDIM")
     teacher.sample(seen(), pull(teacher, [1.0] * 3, "mu", callback=steps.append), generator())
     assert [step.timestep for step in steps] == [16, 12, 8, 4, 0]
-    with pytest.raises(ValueError, match="num_inference_steps=21 exceeds the 20"):
+    with pytest.raises(FlagError, match="num_inference_steps=21 exceeds the 20"):
         teacher.set_sampler(21, None)
 
 
@@ -164,11 +165,11 @@ def test_a_diffusing_dit_can_exchange_its_scheduler(make, tmp_path, kind):
 @pytest.mark.parametrize("kind", FLOWS)
 def test_what_means_nothing_to_a_flow(make, kind):
     teacher = make(kind)
-    with pytest.raises(ValueError, match="guidance.at=mu has no meaning.*use --policy.guidance.at=x0"):
+    with pytest.raises(FlagError, match="guidance.at=mu has no meaning.*use --policy.guidance.at=x0"):
         teacher.sample(seen(), pull(teacher, [1.0] * 3, at="mu"))
-    with pytest.raises(ValueError, match="guidance.at=mu has no meaning"):
+    with pytest.raises(FlagError, match="guidance.at=mu has no meaning"):
         teacher.require_guidance("mu")
-    with pytest.raises(ValueError, match="noise_scheduler=DDIM has no meaning.*integrates a flow"):
+    with pytest.raises(FlagError, match="noise_scheduler=DDIM has no meaning.*integrates a flow"):
         teacher.set_sampler(None, "DDIM")
 
 
@@ -189,6 +190,6 @@ def test_empty_cameras_are_not_needed(make, kind):
 def test_variants_that_cannot_be_guided(make, kind, flag):
     teacher = make(kind)
     parts = teacher.policy, teacher._preprocessor, teacher._postprocessor
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(ValueError, match=f"has {flag}=true"):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(FlagError, match=f"has {flag}=true"):
         patch.setattr(teacher.policy.config, flag, True)
         RTCTeacher(*parts)

@@ -6,7 +6,7 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.act.modeling_act import ACT
 
-from lerobot_agpd.config import TeacherConfig
+from lerobot_agpd.config import FlagError, TeacherConfig
 from lerobot_agpd.guidance.discrepancy import ActionDiscrepancy
 from lerobot_agpd.guidance.guide import Guide
 from lerobot_agpd.loading import load_teacher
@@ -200,5 +200,5 @@ def test_config_round_trip(make_config, tmp_path):
     ],
 )
 def test_wrong_flags_are_named(make_config, options, flag):
-    with pytest.raises(ValueError, match=flag):
+    with pytest.raises(FlagError, match=flag):
         make_config(**options)
