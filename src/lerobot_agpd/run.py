@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,7 +57,8 @@ class RunInfo:
             resume=config.resume,
             image_transforms=ImageTransforms(transforms) if transforms.enable else None,
             lerobot_ema=getattr(ema, "enable", False),
-            sharded=getattr(parallelism, "dp_shard", 1) not in (1, None),
+            sharded=getattr(parallelism, "dp_shard", 1) not in (1, None)
+            or os.environ.get("ACCELERATE_USE_FSDP") == "true",  # how LeRobot 0.6.1 is told
         )
 
     @classmethod

@@ -10,13 +10,13 @@ from lerobot.policies.multi_task_dit.configuration_multi_task_dit import MultiTa
 from lerobot.policies.multi_task_dit.modeling_multi_task_dit import FlowMatchingObjective
 from torch import nn
 
+from lerobot_agpd.guidance import guide as guidance
 from lerobot_agpd.guidance.adapters.flow import GuidedVelocity
 from lerobot_agpd.guidance.adapters.rtc import VelocityGuide
 from lerobot_agpd.guidance.discrepancy import ActionDiscrepancy
 from lerobot_agpd.guidance.flow import clean_variance, guided_velocity
 from lerobot_agpd.guidance.guide import Guide
 
-UNBOUNDED = 1e9  # a trust region that never acts
 MEAN, STD, TARGET = -0.2, 0.5, 0.7
 
 
@@ -45,18 +45,24 @@ def closed_form(n_steps, scale, target=TARGET) -> tuple[float, float]:
         r2 = (1 - tau) ** 2 / (tau**2 + (1 - tau) ** 2)
         weight = min(scale * r2, 1)
         led_to = ((1 - weight) * x0[0], (1 - weight) * x0[1] + weight * target)
-        share = dt / (1 - tau)  # of the way from x to where the velocity leads
+        fraction = dt / (1 - tau)  # of the way from x to where the velocity leads
         slope, offset = (
-            (1 - share + share * led_to[0]) * slope,
-            (1 - share + share * led_to[0]) * offset + share * led_to[1],
+            (1 - fraction + fraction * led_to[0]) * slope,
+            (1 - fraction + fraction * led_to[0]) * offset + fraction * led_to[1],
         )
     return slope, offset
 
 
-def guide_toward(target, scale, trust_region=UNBOUNDED, dims=1, **options) -> Guide:
+@pytest.fixture(autouse=True)
+def unbounded(monkeypatch):
+    """A trust region that never acts, as the closed forms have none."""
+    monkeypatch.setattr(guidance, "TRUST_REGION", 1e9)
+
+
+def guide_toward(target, scale, dims=1, **options) -> Guide:
     """J = 1/2 ||A[1] - target||^2: the chunk's step 0 is not guided."""
     goal = torch.full((len(scale), 1, dims), target, dtype=torch.float64)
-    return Guide(ActionDiscrepancy(goal, 1), torch.as_tensor(scale), trust_region=trust_region, **options)
+    return Guide(ActionDiscrepancy(goal, 1), torch.as_tensor(scale), **options)
 
 
 def objective(n_steps, method="euler") -> FlowMatchingObjective:
@@ -104,11 +110,12 @@ def test_clean_variance_is_the_posterior_variance_of_unit_gaussians(tau):
 
 def test_one_guided_velocity_by_hand():
     """tau = 1/2: x0_hat = 1 + 2/2 = 2, r^2 = 1/2, scale 1: shift = -(2 - 4)/2 = 1, over 1 - tau: 2."""
-    guide = guide_toward(4.0, [1.0, 0.0])
+    steps = []
+    guide = guide_toward(4.0, [1.0, 0.0], callback=steps.append)
     x, velocity = torch.full((2, 2, 1), 1.0), torch.full((2, 2, 1), 2.0)
     bent = guided_velocity(guide, x, velocity, 0.5, action_dim=1)
     assert bent.tolist() == [[[2.0], [4.0]], [[2.0], [2.0]]]
-    assert guide.j[0].tolist() == [2.0, 2.0]
+    assert steps[0].discrepancy.tolist() == [2.0, 2.0]
     assert guide.shift_in_sigmas[0].tolist() == pytest.approx([math.sqrt(2), 0.0])
     assert guided_velocity(guide, x, velocity, 1.0, action_dim=1) is velocity
 
@@ -149,16 +156,17 @@ def test_the_unguided_flow_reaches_the_data():
 
 
 @given(st.integers(2, 30), st.tuples(st.floats(0, 50), st.floats(0, 50)).map(sorted))
-def test_property_more_scale_brings_the_mean_nearer_to_the_student(n_steps, scales):
+def test_more_scale_brings_the_mean_nearer_to_the_student(n_steps, scales):
     less, more = (abs(closed_form(n_steps, k)[1] - TARGET) for k in scales)
     assert more <= less + 1e-12
 
 
 @pytest.mark.parametrize("method", ["euler", "rk4"])
-def test_scale_zero_is_bit_identical_in_the_objective(method):
+def test_scale_zero_is_bit_identical_in_the_objective(method, monkeypatch):
+    monkeypatch.setattr(guidance, "TRUST_REGION", 1.0)
     unguided, _ = sample_objective(8, None, 6, method, torch.float32)
     for scale in ([0.0] * 6, [0.0, 1.0, 0.0, 8.0, 0.0, 0.1]):
-        x, _ = sample_objective(8, guide_toward(TARGET, scale, 1.0), 6, method, torch.float32)
+        x, _ = sample_objective(8, guide_toward(TARGET, scale), 6, method, torch.float32)
         at_zero = torch.tensor(scale) == 0
         assert torch.equal(x[at_zero], unguided[at_zero])
         assert torch.equal(x[:, 0], unguided[:, 0])  # outside the executed window
@@ -186,20 +194,20 @@ def test_padded_dimensions_are_not_guided():
 
 
 @pytest.mark.parametrize("method", ["euler", "rk4"])
-def test_trust_region_bounds_every_step(method):
+def test_trust_region_bounds_every_step(method, monkeypatch):
+    monkeypatch.setattr(guidance, "TRUST_REGION", 0.5)
     seen = []
-    guide = guide_toward(1e6, [1e6] * 5, trust_region=0.5, callback=seen.append)
+    guide = guide_toward(1e6, [1e6] * 5, callback=seen.append)
     x, _ = sample_objective(10, guide, 5, method)
     assert x.abs().max() < 10  # the data, plus at most half a sigma at every step
     for step in seen:
-        assert set(step) == {"timestep", "sigma", "j", "shift", "x0_hat"}
-        assert step["sigma"] == pytest.approx(math.sqrt(clean_variance(step["timestep"])))
-        rms = step["shift"][:, 1].square().mean(dim=1).sqrt()
-        torch.testing.assert_close(rms, torch.full_like(rms, 0.5 * step["sigma"]))
-        assert (step["shift"][:, 0] == 0).all()
+        assert step.sigma == pytest.approx(math.sqrt(clean_variance(step.timestep)))
+        rms = step.shift[:, 1].square().mean(dim=1).sqrt()
+        torch.testing.assert_close(rms, torch.full_like(rms, 0.5 * step.sigma))
+        assert (step.shift[:, 0] == 0).all()
     if method == "euler":
-        assert [step["timestep"] for step in seen] == pytest.approx([k / 10 for k in range(10)])
-        assert len(guide.shift_in_sigmas) == len(guide.j) == 10
+        assert [step.timestep for step in seen] == pytest.approx([k / 10 for k in range(10)])
+        assert len(guide.shift_in_sigmas) == 10
 
 
 def test_without_a_trust_region_any_scale_lands_on_the_student():

@@ -1,4 +1,4 @@
-"""Tiny, randomly initialised multi_task_dit, pi0, pi05 and smolvla: LeRobot's own classes, no weights from the Hub.
+"""Tiny, randomly initialized multi_task_dit, pi0, pi05 and smolvla: LeRobot's own classes, no weights from the Hub.
 
 LeRobot gives pi0 and pi05 no flags for their size, so the size tables of their modules are exchanged.
 """

@@ -6,10 +6,10 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.act.modeling_act import ACT
 
-from lerobot_agpd.guidance.config import TeacherConfig
+from lerobot_agpd.config import FlagError, TeacherConfig
 from lerobot_agpd.guidance.discrepancy import ActionDiscrepancy
 from lerobot_agpd.guidance.guide import Guide
-from lerobot_agpd.guidance.loading import load_teacher
+from lerobot_agpd.loading import load_teacher
 from lerobot_agpd.policies.act_diffusion.configuration_act_diffusion import ACTDiffusionConfig
 from lerobot_agpd.policies.act_diffusion.modeling_act_diffusion import ACTDiffusionPolicy
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
@@ -175,7 +175,7 @@ def test_it_teaches(make_config, demonstrations, tmp_path, at):
         if scale is not None:
             guide = Guide(ActionDiscrepancy(target, teacher.start), torch.full((B,), scale), at=at)
         torch.manual_seed(5)
-        chunks[scale] = teacher.to_units(teacher.sample(history, guide))
+        chunks[scale] = teacher.normalize(teacher.sample(history, guide))
     assert chunks[None].shape == (B, H, 2)
     assert torch.equal(chunks[None], chunks[0.0])
     distance = {scale: (chunk - target).square().mean() for scale, chunk in chunks.items()}
@@ -200,5 +200,5 @@ def test_config_round_trip(make_config, tmp_path):
     ],
 )
 def test_wrong_flags_are_named(make_config, options, flag):
-    with pytest.raises(ValueError, match=flag):
+    with pytest.raises(FlagError, match=flag):
         make_config(**options)

@@ -3,7 +3,7 @@
 import pytest
 from safetensors.torch import load_file, save_file
 
-from lerobot_agpd.distill.config import AdversaryConfig
+from lerobot_agpd.config import AdversaryConfig
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
 
 

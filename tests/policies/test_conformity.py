@@ -75,16 +75,20 @@ def dataset(request, demonstrations, filmed) -> LeRobotDataset:
     return filmed if request.param == "images" else demonstrations
 
 
-@pytest.fixture(params=CASES)
-def config(request, dataset) -> PreTrainedConfig:
-    policy_type, sizes, for_images = CASES[request.param]
-    if dataset.meta.camera_keys:
-        sizes = {**sizes, **for_images, "pretrained_backbone_weights": None}
-    config = make_policy_config(policy_type, push_to_hub=False, device="cpu", **deepcopy(sizes))
+def make_config(case, **options) -> PreTrainedConfig:
+    policy_type, sizes, _ = CASES[case]
+    config = make_policy_config(policy_type, push_to_hub=False, device="cpu", **deepcopy(sizes), **options)
     if hasattr(config, "adversary"):  # the checks train without a teacher
         config.collect.every = 0
         config.adversary.weight = 0
     return config
+
+
+@pytest.fixture(params=CASES)
+def config(request, dataset) -> PreTrainedConfig:
+    _, _, for_images = CASES[request.param]
+    options = {**for_images, "pretrained_backbone_weights": None} if dataset.meta.camera_keys else {}
+    return make_config(request.param, **options)
 
 
 @pytest.fixture
@@ -98,6 +102,11 @@ def batch(config, policy, dataset) -> dict:
     deltas = resolve_delta_timestamps(config, dataset.meta)
     items = LeRobotDataset(dataset.repo_id, root=dataset.root, delta_timestamps=deltas)
     return default_collate([items[0], items[4], items[7]])
+
+
+def series(*shape) -> torch.Tensor:
+    """Evenly spaced numbers from -1 to 1."""
+    return torch.linspace(-1, 1, int(np.prod(shape))).view(shape)
 
 
 def observation(config) -> dict[str, torch.Tensor]:
@@ -213,3 +222,39 @@ def test_moves_between_precisions(policy):
     before = {key: value.clone() for key, value in policy.state_dict().items()}
     policy.to(torch.float64).to(torch.float32)
     assert all(torch.equal(before[key], value) for key, value in policy.state_dict().items())
+
+
+@pytest.mark.parametrize(
+    ("case", "history", "loss", "grad_norm", "n_parameters", "actions"),
+    [
+        ("agpd", (), 3.4338076, 12.5141315, 34018, 1.1267710),
+        ("dp-mlp", (2,), 0.3442916, 0.1253975, 18912, -0.6403990),
+        ("dp-t", (2,), 0.3732229, 0.2842617, 6914, -0.4353137),
+        ("dp-c", (2,), 0.3532942, 0.2268925, 160418, 0.5731734),
+        ("agpd-dp", (2,), 0.3442916, 0.1253975, 18912, -0.6403990),
+        ("act-dp", (1,), 0.3547188, 0.1246375, 16322, -0.0028088),
+    ],
+)
+def test_golden_scalars(
+    input_features, output_features, case, history, loss, grad_norm, n_parameters, actions
+):
+    """Loss, gradient, size and actions at fixed weights, data and seeds: a change of any is on purpose."""
+    config = make_config(case, input_features=dict(input_features), output_features=dict(output_features))
+    policy = get_policy_class(config.type)(config).train()
+    torch.manual_seed(0)
+    for parameter in policy.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    shapes = {key: feature.shape for key, feature in input_features.items()}
+    batch = {key: series(3, *history, *shape) for key, shape in shapes.items()}
+    batch |= {"action": series(3, 8, 2), "action_is_pad": torch.zeros(3, 8, dtype=torch.bool)}
+    torch.manual_seed(1)
+    batch_loss, _ = policy.forward(batch)
+    batch_loss.backward()
+    squares = [p.grad.square().sum() for p in policy.parameters() if p.grad is not None]
+    policy.eval()
+    torch.manual_seed(2)
+    action = policy.select_action({key: series(3, *shape) for key, shape in shapes.items()})
+
+    scalars = (batch_loss.item(), sum(squares).sqrt().item(), action.sum().item())
+    assert scalars == pytest.approx((loss, grad_norm, actions), rel=1e-3, abs=1e-4)
+    assert sum(parameter.numel() for parameter in policy.parameters()) == n_parameters

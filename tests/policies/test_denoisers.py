@@ -5,6 +5,7 @@ import torch
 from hypothesis import given, settings, strategies as st
 from torch import nn
 
+from lerobot_agpd.config import FlagError
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
     MLPDenoiserConfig,
     TransformerDenoiserConfig,
@@ -184,5 +185,5 @@ def test_conditions_are_repeated_for_consecutive_actions():
     ],
 )
 def test_wrong_sizes_are_named(config, options, flag):
-    with pytest.raises(ValueError, match=flag):
+    with pytest.raises(FlagError, match=flag):
         config(**options)

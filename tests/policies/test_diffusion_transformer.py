@@ -16,6 +16,7 @@ from lerobot.utils.hub import HubMixin
 from safetensors.torch import load_file, save_file
 from torch.utils.data import default_collate
 
+from lerobot_agpd.config import FlagError
 from lerobot_agpd.policies.diffusion_transformer.averaged_weights import RAW_WEIGHTS
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
     DiffusionTransformerConfig,
@@ -240,7 +241,7 @@ def test_only_the_main_process_writes(make_policy, batch, tmp_path, later_lerobo
     [(RunInfo(lerobot_ema=True), "--ema.enable=true"), (RunInfo(sharded=True), r"--parallelism\.\*")],
 )
 def test_runs_that_cannot_be_averaged_are_refused(make_policy, batch, run, flag):
-    with pytest.raises(ValueError, match=rf"(?s)--policy.ema=true.*{flag}.*--policy.ema=false"):
+    with pytest.raises(FlagError, match=rf"(?s)--policy.ema=true.*{flag}.*--policy.ema=false"):
         make_policy(run=run)
     fit(make_policy(run=run, ema=False), batch, 1)
 
@@ -369,13 +370,13 @@ def test_frames_from_memory_give_the_loss_of_the_loaders_chunks(demonstrations, 
     ],
 )
 def test_wrong_flags_are_named(make_policy, options, flag):
-    with pytest.raises(ValueError, match=flag):
+    with pytest.raises(FlagError, match=flag):
         make_policy(**options)
 
 
 def test_a_policy_without_a_state_is_refused(make_policy, input_features):
     without = {k: v for k, v in input_features.items() if k != "observation.state"}
-    with pytest.raises(ValueError, match="observation.state and action"):
+    with pytest.raises(FlagError, match="observation.state and action"):
         make_policy(input_features=without)
 
 

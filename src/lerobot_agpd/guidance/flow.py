@@ -9,7 +9,7 @@ arXiv:2506.07339, makes the same assumption)
 so tilting the teacher by exp(-scale J) shifts the mean of x0 by -scale r^2 grad J to first order. The guided
 velocity leads to the shifted chunk:
 
-    v + shift / (1 - tau),    shift = -min(scale r^2, 1) grad J(x0_hat), its rms at most trust_region * r.
+    v + shift / (1 - tau),    shift = -min(scale r^2, 1) grad J(x0_hat), its rms at most TRUST_REGION * r.
 
 J is never differentiated through the network. An Euler step to tau + dt covers dt / (1 - tau) <= 1 of the way
 to the shifted chunk, so that the chain stays bounded at any scale.
@@ -32,7 +32,7 @@ def guided_velocity(guide: Guide, x_tau: Tensor, velocity: Tensor, tau: float, a
     """Shift a velocity toward the student's chunk.
 
     Args:
-        guide: J, scales and trust region; its steps are called with tau.
+        guide: J and scales; its steps are called with tau.
         x_tau: (B, H, D) the noisy chunk; its first `action_dim` dimensions are actions, the others padding.
         velocity: (B, H, D) dx / dtau as the teacher predicts it, from noise to data.
         tau: time from 0 (noise) to 1 (data).

@@ -36,9 +36,9 @@ class ChunkTeacher(Teacher):
     ) -> Tensor:
         with seeded_by(generator):
             chunk = self.policy.predict_action_chunk(self._now(batch))
-        require(
-            chunk.ndim == 3 and chunk.shape[1] >= self.n_chunk_steps,
-            f"predict_action_chunk of the {self.type} teacher returned shape {tuple(chunk.shape)}; chunks are "
-            f"(B, {self.n_chunk_steps} or more, A)",
-        )
+        if chunk.ndim != 3 or chunk.shape[1] < self.n_chunk_steps:
+            raise ValueError(
+                f"predict_action_chunk of the {self.type} teacher returned shape {tuple(chunk.shape)}; chunks are "
+                f"(B, {self.n_chunk_steps} or more, A)"
+            )
         return chunk

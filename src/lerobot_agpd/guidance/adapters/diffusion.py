@@ -73,7 +73,7 @@ def set_diffusion_sampler(
     """Exchange the noise scheduler of a model, and the number of its steps; None keeps either.
 
     Raises:
-        ValueError: if there are more steps than the model was trained with.
+        FlagError: if there are more steps than the model was trained with.
     """
     if noise_scheduler is not None:
         model.noise_scheduler = SCHEDULER_CLASSES[noise_scheduler].from_config(model.noise_scheduler.config)

@@ -45,7 +45,7 @@ class MultiTaskDiTTeacher(DiffusionTeacher):
         policy = self.policy
         condition = policy.observation_encoder.encode(stack_cameras(policy.config, batch))  # (B, C)
         model = policy.noise_predictor
-        if guide is not None and policy.config.is_flow_matching and bool((guide.scale > 0).any()):
+        if guide is not None and policy.config.is_flow_matching and guide.acts:
             model = GuidedVelocity(model, guide)
         diffusion_guide = guide if policy.config.is_diffusion else None
         with seeded_by(generator), guided(policy.objective, diffusion_guide):

@@ -93,7 +93,7 @@ class VelocityGuide:
     """An RTC processor for LeRobot's `euler_integrate` that guides toward the student's chunk.
 
     Args:
-        guide: J, scales and trust region.
+        guide: J and scales.
         action_dim: dimensions of the padded actions that are guided, the first ones.
     """
 
@@ -125,7 +125,7 @@ class VelocityGuide:
 @contextmanager
 def velocities_guided(policy: Any, guide: Guide | None, action_dim: int) -> Iterator[None]:
     """Sample from a policy under a guide; without one, or at scale 0, the policy is untouched."""
-    if guide is None or not bool((guide.scale > 0).any()):
+    if guide is None or not guide.acts:
         yield
         return
     processor, config = policy.model.rtc_processor, policy.config.rtc_config

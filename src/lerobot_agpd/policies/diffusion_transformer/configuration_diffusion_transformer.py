@@ -145,8 +145,8 @@ class DiffusionTransformerConfig(DiffusionConfig):
         """Check the features.
 
         Raises:
-            ValueError: if state or action are missing, images are to be cut from memory, or LeRobot refuses the
-                features.
+            FlagError: if state or action are missing, or images are to be cut from memory.
+            ValueError: if LeRobot refuses the features.
         """
         require(
             self.robot_state_feature is not None and self.action_feature is not None,

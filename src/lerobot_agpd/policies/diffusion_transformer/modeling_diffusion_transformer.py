@@ -137,7 +137,7 @@ def _check_averaging(run: RunInfo) -> None:
     """Refuse runs in which the weights cannot be averaged.
 
     Raises:
-        ValueError: if LeRobot averages them too, or no process holds all of them.
+        FlagError: if LeRobot averages them too, or no process holds all of them.
     """
     require(
         not run.lerobot_ema,
