@@ -1,19 +1,18 @@
 """`--dataset.image_transforms.*` on the images that T reads itself."""
 
-import sys
-
 import numpy as np
 import pytest
 import torch
-from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
+from lerobot.configs import DatasetConfig, FeatureType, NormalizationMode, PolicyFeature
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.transforms import ImageTransforms
+from lerobot.transforms import ImageTransforms, ImageTransformsConfig
 
 from lerobot_agpd.replay.demonstrations import DemonstrationFrames
 from lerobot_agpd.replay.episode import Episode, EpisodeRecord, EpisodeSpec
 from lerobot_agpd.replay.journal import EpisodeJournal
 from lerobot_agpd.replay.replay import FRAME_INDEX, Replay
-from lerobot_agpd.run import this_run
+from lerobot_agpd.run import RunInfo
 
 IMAGE, STATE = "observation.image", "observation.state"
 SHAPE = (3, 4, 6)
@@ -58,7 +57,7 @@ def collected(demonstrations, tmp_path_factory):
 
 
 class Negative:
-    """A transform that is easily recognised; notes the shapes it is given."""
+    """A transform that is easily recognized; notes the shapes it is given."""
 
     def __init__(self):
         self.shapes = []
@@ -137,7 +136,7 @@ def test_held_out_batches_and_the_teachers_histories_are_not_transformed(make_re
     assert values(history).tolist() == [[1, 2], [200, 201]]
 
 
-def test_a_frame_is_decoded_once_for_all_cameras_and_rows(make_replay, agpd_diffusion_config, monkeypatch):
+def test_a_demonstration_frame_is_decoded_once_for_all_rows(make_replay, agpd_diffusion_config, monkeypatch):
     replay, batch = make_replay(agpd_diffusion_config, None, drop_n_last_frames=0)
     decoded, read = [], LeRobotDataset.__getitem__
     monkeypatch.setattr(
@@ -148,18 +147,13 @@ def test_a_frame_is_decoded_once_for_all_cameras_and_rows(make_replay, agpd_diff
     assert torch.equal(values(drawn[IMAGE]), drawn[STATE][..., 0].long())
 
 
-def test_the_runs_transforms_are_found(monkeypatch, tmp_path):
-    def transforms(*flags):
-        monkeypatch.setattr(sys, "argv", ["lerobot-train", *flags])
-        return this_run().image_transforms
+def test_the_runs_transforms_are_found(agpd_config):
+    def transforms(enable):
+        images = ImageTransformsConfig(enable=enable, max_num_transforms=1)
+        dataset = DatasetConfig(repo_id="a/b", image_transforms=images)
+        return RunInfo.from_train_config(TrainPipelineConfig(dataset, policy=agpd_config())).image_transforms
 
-    file = tmp_path / "run.yaml"
-    file.write_text("dataset: {repo_id: a/b, image_transforms: {enable: true, max_num_transforms: 2}}")
-    assert transforms() is None and transforms("--dataset.image_transforms.max_num_transforms=1") is None
-    found = transforms(
-        "--dataset.image_transforms.enable=true", "--dataset.image_transforms.max_num_transforms=1"
-    )
+    assert transforms(False) is None
+    found = transforms(True)
     assert isinstance(found, ImageTransforms) and found.tf.n_subset == 1
     assert found(torch.rand(2, *SHAPE)).shape == (2, *SHAPE)
-    assert transforms(f"--config_path={file}").tf.n_subset == 2
-    assert transforms(f"--config_path={file}", "--dataset.image_transforms.enable=false") is None

@@ -9,6 +9,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_agpd.cli import merge as command
+from lerobot_agpd.config import FlagError
 from lerobot_agpd.replay.export import check_observation, merge
 from lerobot_agpd.replay.frames import FrameTable
 from lerobot_agpd.replay.journal import EpisodeJournal
@@ -102,9 +103,9 @@ def test_the_command_says_what_is_wrong(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["lerobot-agpd-merge", f"--root={tmp_path}"])
     with pytest.raises(SystemExit, match="holds no kept episode"):
         command.main()
-    with pytest.raises(ValueError, match="--root=.*is not a folder"):
+    with pytest.raises(FlagError, match="--root=.*is not a folder"):
         command.MergeConfig(root=tmp_path / "nothing")
-    with pytest.raises(ValueError, match="needs --repo_id"):
+    with pytest.raises(FlagError, match="needs --repo_id"):
         command.MergeConfig(root=tmp_path, push_to_hub=True)
 
 

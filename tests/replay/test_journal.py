@@ -4,15 +4,16 @@ import json
 import logging
 import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
 
+from lerobot_agpd.files import write_array
 from lerobot_agpd.replay import stored as stored_module
 from lerobot_agpd.replay.episode import Episode, EpisodeRecord, EpisodeSpec
-from lerobot_agpd.files import write_array
 from lerobot_agpd.replay.journal import EpisodeJournal
 from lerobot_agpd.replay.stored import MAX_OPEN_FILES
 
@@ -25,6 +26,7 @@ def same(left, right) -> bool:
 
 def assert_holds(stored, episode):
     assert len(stored) == len(episode) and set(stored.keys) == set(episode.columns)
+    assert set(stored.observations) == set(episode.observations)
     for key, values in episode.columns.items():
         column = stored.column(key)
         assert column.dtype == values.dtype
@@ -111,7 +113,7 @@ def test_property_any_episode_round_trips(data, tmp_path_factory, demonstrations
 
 
 def test_large_arrays_are_written_in_blocks(tmp_path, monkeypatch):
-    monkeypatch.setattr("lerobot_agpd.replay.files.BLOCK_BYTES", 100)
+    monkeypatch.setattr("lerobot_agpd.files.BLOCK_BYTES", 100)
     rng = np.random.default_rng(0)
     vectors = {"a": rng.normal(size=(17, 3)), "b": np.arange(17)}
     write_array(tmp_path / "vectors.npy", vectors)
@@ -172,7 +174,8 @@ def test_a_report_makes_a_round_finished(journal, add, make_episode):
     assert [(number, e.record.number) for number, e in journal.stored()] == [(0, 0), (1, 1), (1, 2)]
 
 
-def test_rounds_beyond_any_width(journal, add, make_episode):
+def test_rounds_beyond_any_width(journal, add, make_episode, monkeypatch):
+    monkeypatch.setattr("os.fsync", lambda descriptor: None)  # a thousand of them take long
     for number in (99_999, 100_000):
         add(journal, number, 0, make_episode(number))
     assert [number for number, _ in journal.stored()] == [99_999, 100_000]
@@ -203,6 +206,8 @@ def test_another_runs_episodes_are_refused(journal, demonstrations):
     with pytest.raises(ValueError, match=r"seed 1 instead of 2.*--policy.replay.root.*--resume=true"):
         again.begin(demonstrations.meta, {**IDENTITY, "seed": 2})
     again.begin(demonstrations.meta, {**IDENTITY, "seed": 2}, resume=True)
+    with pytest.raises(ValueError, match=r"student None instead of"):
+        again.begin(demonstrations.meta, {**IDENTITY, "student": Path("s")})
     assert EpisodeJournal(journal.root).header["identity"] == IDENTITY
 
 

@@ -188,12 +188,16 @@ def test_executed_future_and_its_mask(make_replay, deliver, collected, normalize
     replay.extend([collected[0]])
     replay.observe(deliver([0]))
     rows = torch.tensor([0, 3, 5, 13, 14])
-    now, executed, later, is_pad = replay.executed_future(rows, ["observation.state"], 3)
+    future = replay.executed_future(rows, ["observation.state"], 3)
     recorded = normalizer.normalize("action", replay.table.columns["action"])
-    assert torch.equal(executed[0], recorded[0:3]) and torch.equal(executed[3], recorded[13:16])
-    steps = [normalizer.unnormalize("observation.state", x)[:, 1].round().tolist() for x in (now, later)]
+    assert torch.equal(future.actions[0], recorded[0:3])
+    assert torch.equal(future.actions[3], recorded[13:16])
+    steps = [
+        normalizer.unnormalize("observation.state", x)[:, 1].round().tolist()
+        for x in (future.observation, future.later)
+    ]
     assert steps == [[0, 3, 0, 0, 1], [3, 4, 0, 3, 3]]
-    assert is_pad.tolist() == [False, True, True, False, True]
+    assert future.is_pad.tolist() == [False, True, True, False, True]
 
 
 def test_a_batch_under_other_statistics_is_refused(make_replay, deliver):

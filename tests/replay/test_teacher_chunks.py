@@ -42,7 +42,9 @@ def chunks(replay):
 
 
 def raw(chunks, frames, seen=()):
-    found, shared = chunks.at(torch.tensor(frames), seen)
+    """The teacher's steps in raw units, and the others, after the loader has delivered the episodes `seen`."""
+    chunks.replay.seen_episodes.update(seen)
+    found, shared = chunks.at(torch.tensor(frames))
     normalizer = chunks.replay.demonstrations.normalizer
     return normalizer.unnormalize("action", found[:, :shared]), found[:, shared:]
 
@@ -60,13 +62,13 @@ def test_chunks_are_the_teachers_and_zero_beyond_its_own(chunks):
 
 def test_noise_is_the_episodes_own(chunks, demonstrations):
     """Seeded by the episode's first frame: when it is sampled does not matter."""
-    found, _ = raw(chunks, [6, 8], {2})
+    found, _ = raw(chunks, [6, 8])
     noise = torch.rand((7, 5, 2), generator=torch.Generator().manual_seed(7 + 6))
     states = torch.tensor([[2.0, 0.0], [2.0, 2.0]])[:, None] + torch.arange(3.0)[None, :, None]
     torch.testing.assert_close(found, states + noise[[0, 2], :3], rtol=0, atol=1e-4)
     other = TeacherChunks(Teacher(), chunks.replay, n_chunk_steps=4, seed=7)
     raw(other, [0], {0, 1})
-    assert torch.equal(raw(other, [6, 8], {2})[0], found)
+    assert torch.equal(raw(other, [6, 8])[0], found)
 
 
 def test_every_frame_is_sampled_once(chunks, stored):

@@ -88,7 +88,7 @@ class EpisodeJournal:
             self.root.mkdir(parents=True, exist_ok=True)
             write_json(self.root / HEADER, {**content, "identity": dict(identity)}, indent=2)
         if not resume:
-            self._check_identity(json.loads(json.dumps(identity)))
+            self._check_identity(json.loads(json.dumps(dict(identity), default=str)))
 
     def _check_identity(self, identity: Mapping[str, Any]) -> None:
         recorded = self.header["identity"]

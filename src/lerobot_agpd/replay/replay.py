@@ -23,7 +23,7 @@ FRAME_INDEX = "agpd.frame_index"
 """Batch key of each frame's number in T: demonstrations first, under the dataset's own frame index."""
 
 
-class ReplayConfig(Protocol):
+class BatchConfig(Protocol):
     """What the replay reads of a student's configuration.
 
     Attributes:
@@ -77,7 +77,7 @@ class Replay:
     def __init__(
         self,
         demonstrations: DemonstrationFrames,
-        config: ReplayConfig,
+        config: BatchConfig,
         collected_fraction: float | None,
         image_transforms: Callable[[Tensor], Tensor] | None = None,
     ):
