@@ -7,7 +7,7 @@ import pytest
 
 from lerobot_agpd.dataset_writer import DatasetWriter, flag, vector
 
-FEATURES = {"observation.state": vector(shape=(2,)), "action": vector(shape=(1,)), "next.done": flag()}
+FEATURES = {"observation.state": vector(2), "action": vector(1), "next.done": flag()}
 
 
 def episode(number: int, length: int = 3):

@@ -11,10 +11,9 @@ import logging
 import shutil
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from itertools import batched
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -24,17 +23,26 @@ logger = logging.getLogger(__name__)
 Frame = dict[str, Any]
 """One value per feature, and the sentence `task`."""
 
+Feature = dict[str, Any]
+"""LeRobot's description of one value of a frame: dtype, shape and names."""
+
 JsonDict = Mapping[str, Any]
 PLAN = "plan.json"
 
-vector = partial(dict, dtype="float32", names=None)
-"""A float32 feature; takes its `shape`."""
 
-flag = partial(dict, dtype="bool", shape=(1,), names=None)
-"""A bool feature of one number."""
+def vector(dim: int) -> Feature:
+    """Feature of `dim` float32 numbers."""
+    return {"dtype": "float32", "shape": (dim,), "names": None}
 
-image = partial(dict, dtype="image", names=["height", "width", "channel"])
-"""An image feature; takes its `shape` (height, width, channels) and perhaps the `dtype` video."""
+
+def flag() -> Feature:
+    """Feature of one bool."""
+    return {"dtype": "bool", "shape": (1,), "names": None}
+
+
+def image(shape: tuple[int, ...], dtype: Literal["image", "video"] = "image") -> Feature:
+    """Feature of a uint8 image (height, width, channels), stored as PNG or in a video."""
+    return {"dtype": dtype, "shape": shape, "names": ["height", "width", "channel"]}
 
 
 @dataclass(frozen=True)
@@ -56,7 +64,7 @@ class DatasetWriter:
     root: Path
     repo_id: str
     fps: int
-    features: dict[str, dict[str, Any]]
+    features: dict[str, Feature]
     robot_type: str | None = None
     use_videos: bool = False
     plan: JsonDict | None = None

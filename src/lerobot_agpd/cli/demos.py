@@ -91,13 +91,13 @@ class DemosConfig:
 def dataset_features(config: DemosConfig) -> dict[str, dict[str, Any]]:
     """Features of a recorded frame: the environment's, reward, success, end of the episode and perhaps the skill."""
     features = {
-        config.env.features_map[key]: (image if feature.type is FeatureType.VISUAL else vector)(
-            shape=tuple(feature.shape)
-        )
+        config.env.features_map[key]: image(tuple(feature.shape))
+        if feature.type is FeatureType.VISUAL
+        else vector(*feature.shape)
         for key, feature in config.env.features.items()
     }
-    features |= {REWARD: vector(shape=(1,)), SUCCESS: flag(), DONE: flag()}
-    return features if config.skills == [1.0] else features | {SKILL: vector(shape=(1,))}
+    features |= {REWARD: vector(1), SUCCESS: flag(), DONE: flag()}
+    return features if config.skills == [1.0] else features | {SKILL: vector(1)}
 
 
 def record_demos(config: DemosConfig) -> DemosReport:
@@ -108,7 +108,7 @@ def record_demos(config: DemosConfig) -> DemosReport:
         RuntimeError: if too few episodes succeed.
         ModuleNotFoundError: if the package of the environment is not installed.
     """
-    assert isinstance(config.env, SingleEnvConfig)  # all those with experts are
+    assert isinstance(config.env, SingleEnvConfig) and config.env.fps is not None  # as all with experts
     report = DemosReport(task=str(config.env.task))
     writer = DatasetWriter(config.root, config.repo_id, config.env.fps, dataset_features(config))
 

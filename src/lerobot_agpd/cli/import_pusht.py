@@ -75,15 +75,15 @@ class ImportPushTConfig:
 def dataset_features(variant: Variant) -> dict[str, dict[str, Any]]:
     """Features of lerobot/pusht_keypoints (keypoints) or lerobot/pusht (image); state has the block's pose instead."""
     beside_agent = {
-        "keypoints": {OBS_ENV_STATE: vector(shape=(16,))},
-        "state": {OBS_ENV_STATE: vector(shape=(3,))},
-        "image": {OBS_IMAGE: image(shape=IMAGE_SHAPE)},
+        "keypoints": {OBS_ENV_STATE: vector(16)},
+        "state": {OBS_ENV_STATE: vector(3)},
+        "image": {OBS_IMAGE: image(IMAGE_SHAPE)},
     }
     return {
-        OBS_STATE: vector(shape=(2,)),
+        OBS_STATE: vector(2),
         **beside_agent[variant],
-        ACTION: vector(shape=(2,)),
-        REWARD: vector(shape=(1,)),
+        ACTION: vector(2),
+        REWARD: vector(1),
         SUCCESS: flag(),
         DONE: flag(),
     }

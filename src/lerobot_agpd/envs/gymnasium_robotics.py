@@ -19,7 +19,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import OBS_IMAGE
 
 from lerobot_agpd.envs.base import PIXELS, RenderMode, SingleEnvConfig, require_packages
-from lerobot_agpd.envs.robotics_tasks import KITCHEN, KITCHEN_DEFAULT, OBSERVED_KEYS, get_task
+from lerobot_agpd.envs.robotics_tasks import KITCHEN, KITCHEN_DEFAULT, OBSERVED_KEYS, KitchenTask, get_task
 
 Task = Literal[
     "FetchReach-v4",
@@ -33,15 +33,6 @@ Task = Literal[
     "FrankaKitchen-v1",
 ]
 ObsType = Literal["state", "pixels", "pixels_agent_pos"]
-KitchenTask = Literal[
-    "bottom burner",
-    "top burner",
-    "light switch",
-    "slide cabinet",
-    "hinge cabinet",
-    "microwave",
-    "kettle",
-]
 
 
 def make_single_env(

@@ -6,7 +6,7 @@ They come as Diffusion Policy's own replay buffer, a zarr v2 group with `data/st
 """
 
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -69,8 +69,8 @@ def _load_zarr(path: Path, names: Iterable[str]) -> Arrays:
         store.close()
 
 
-def _read(archive: Mapping[str, Any], places: dict[str, str], source: str) -> Arrays:
-    """Read arrays by name, each from its place in an archive.
+def _read(archive: Any, places: dict[str, str], source: str) -> Arrays:
+    """Read arrays by name, each from its place in an archive (of numpy or zarr, which both act as mappings).
 
     Raises:
         ValueError: naming the arrays that are missing, or images that are none.

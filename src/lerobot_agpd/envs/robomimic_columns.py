@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from lerobot.utils.constants import ACTION, DONE, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE, REWARD, SUCCESS
@@ -76,21 +76,21 @@ class RobomimicColumns:
     has_environment_state: bool = True
     has_rewards: bool = True
     has_dones: bool = True
-    image_dtype: str = "image"
+    image_dtype: Literal["image", "video"] = "image"
 
     @property
     def features(self) -> dict[str, dict[str, Any]]:
         """LeRobot's features."""
         shapes = self.file.observation_shapes(self.demos[0])
-        features: dict[str, dict[str, Any]] = {OBS_STATE: vector(shape=(self.task.agent_pos_dim,))}
+        features: dict[str, dict[str, Any]] = {OBS_STATE: vector(self.task.agent_pos_dim)}
         if self.has_environment_state:
-            features[OBS_ENV_STATE] = vector(shape=(self.task.environment_state_dim,))
+            features[OBS_ENV_STATE] = vector(self.task.environment_state_dim)
         for camera in self.cameras:
             shape = shapes[camera + CAMERA_SUFFIX]
-            features[f"{OBS_IMAGES}.{camera}"] = image(dtype=self.image_dtype, shape=shape)
-        features[ACTION] = vector(shape=(self.task.action_dim,))
+            features[f"{OBS_IMAGES}.{camera}"] = image(shape, self.image_dtype)
+        features[ACTION] = vector(self.task.action_dim)
         if self.has_rewards:
-            features |= {REWARD: vector(shape=(1,)), SUCCESS: flag()}
+            features |= {REWARD: vector(1), SUCCESS: flag()}
         if self.has_dones:
             features[DONE] = flag()
         if self.file.operators:

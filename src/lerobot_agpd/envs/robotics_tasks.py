@@ -6,7 +6,7 @@ and what success means) and in `gymnasium_robotics.Task`.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -163,7 +163,16 @@ TASKS: dict[str, TaskSpec] = {
 }
 
 KITCHEN = "FrankaKitchen-v1"
-KITCHEN_DEFAULT = ("microwave", "kettle", "light switch", "slide cabinet")
+KitchenTask = Literal[
+    "bottom burner",
+    "top burner",
+    "light switch",
+    "slide cabinet",
+    "hinge cabinet",
+    "microwave",
+    "kettle",
+]
+KITCHEN_DEFAULT: tuple[KitchenTask, ...] = ("microwave", "kettle", "light switch", "slide cabinet")
 """The four of D4RL's `kitchen-complete` (arXiv:2004.07219)."""
 
 
