@@ -50,6 +50,7 @@ def test_one_line(name, monkeypatch, tmp_path):
 
 
 def test_flags_and_the_checkpoint_may_come_from_a_file(monkeypatch, tmp_path):
+    monkeypatch.setattr("lerobot.configs.parser._config_path_args", {})  # LeRobot keeps what a file says
     path = tmp_path / "flags.yaml"
     path.write_text(f"{{env: {{type: pusht}}, policy: {{path: {tmp_path / 'nowhere'}}}}}")
     with pytest.raises(SystemExit, match="lerobot-agpd-viz: .*nowhere"):

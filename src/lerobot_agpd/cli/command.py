@@ -70,7 +70,7 @@ def _parse[C](config_class: type[C], args: list[str]) -> C:
     if "--help" in args or "-h" in args:
         parser.print_scoped_help(config_class, args)
         sys.exit(0)
-    path_fields = getattr(config_class, "__get_path_fields__", list)()
+    path_fields: list[str] = getattr(config_class, "__get_path_fields__", list)()
     args = parser.filter_path_args(path_fields, args)
     config_path = parser.parse_arg("config_path", args)
     if config_path:

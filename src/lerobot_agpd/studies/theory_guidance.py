@@ -146,30 +146,6 @@ def k_of_lambda(policies: Policies, lam: float, tilt: Tilt, mixing: Mixing, prin
     return fraction / ((1 - fraction) * policies.var_teacher) if fraction < 1 else math.inf
 
 
-def lambda_of_k(
-    policies: Policies, k: float, tilt: Tilt, mixing: Mixing, printed: bool = False
-) -> list[float]:
-    """Every lambda in [0, 1] at which mixing has the variance of guidance with strength k, ascending.
-
-    Mixing's variance is a parabola in lambda, so there are none, one or two.
-
-    Raises:
-        ValueError: where all of them do (equal policies and k = 0).
-    """
-    var_e, var_a = policies.var_teacher, policies.var_student
-    target = guide(policies, k, tilt).variance
-    if mixing is Mixing.INTERPOLATE:
-        square, linear = var_a + var_e, -2 * var_e
-    else:
-        gap_sq = policies.gap**2 / (1 if printed else policies.dim)
-        square, linear = -gap_sq, var_a - var_e + gap_sq
-    if square == linear == 0 and target == var_e:
-        raise ValueError("teacher and student are equal and k = 0: every lambda has the same variance")
-    roots = np.roots([square, linear, var_e - target])
-    real = roots.real[np.abs(roots.imag) < 1e-7]
-    return sorted(float(np.clip(root, 0, 1)) for root in real if -1e-9 <= root <= 1 + 1e-9)
-
-
 def kl_to_teacher(policies: Policies, law: ActionLaw) -> float:
     """KL(executed || teacher) between Gaussians of these moments, in nats (Eq. 14).
 
