@@ -1,92 +1,82 @@
+"""Flags: which values are refused, and whether the message reaches the command line."""
+
 import json
-from dataclasses import dataclass, field
 
 import draccus
 import pytest
-from hypothesis import given, strategies as st
+from draccus.utils import ParsingError
+from lerobot.configs.train import TrainPipelineConfig
 
-from lerobot_agpd.collect.config import (
-    CollectConfig,
-    DiagnosticsConfig,
-    MixingConfig,
-    RollinConfig,
-    VariationConfig,
-)
+from lerobot_agpd import config as groups
+from lerobot_agpd.config import CollectConfig, FlagError, MixingConfig
+from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig
 
-
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ({"schedule": "constant"}, [0.6, 0.6, 0.6, 0.6]),
-        ({"schedule": "linear", "rounds": 2}, [0.0, 0.3, 0.6, 0.6]),
-        ({"schedule": "exponential", "decay": 0.5}, [0.0, 0.3, 0.45, 0.525]),
-        ({"schedule": "exponential", "decay": 0.0}, [0.0, 0.6, 0.6, 0.6]),  # beta = indicator of round 0
-    ],
-)
-def test_schedules_by_hand(options, expected):
-    config = MixingConfig(weight=0.6, **options)
-    assert [config.weight_at(number) for number in range(4)] == pytest.approx(expected)
-
-
-@given(st.floats(0, 1), st.sampled_from(["constant", "linear", "exponential"]), st.floats(0, 0.99))
-def test_property_weights_rise_to_the_limit(weight, schedule, decay):
-    config = MixingConfig(weight=weight, schedule=schedule, decay=decay)
-    weights = [config.weight_at(number) for number in range(30)]
-    assert weights == sorted(weights) and weights[0] >= 0 and weights[-1] <= weight
-
-
-@pytest.mark.parametrize(
-    ("group", "kind", "options"),
-    [
-        ("mixing", MixingConfig, {"form": "add"}),
-        ("mixing", MixingConfig, {"weight": 1.1}),
-        ("mixing", MixingConfig, {"schedule": "cosine"}),
-        ("mixing", MixingConfig, {"rounds": 0}),
-        ("mixing", MixingConfig, {"decay": 1.0}),
-        ("rollin", RollinConfig, {"max_fraction": 0.0}),
-        ("rollin", RollinConfig, {"episode_steps": 0}),
-        ("variation", VariationConfig, {"quantile": 1.0}),
-        ("variation", VariationConfig, {"scale_spread": 0.5}),
-        ("diagnostics", DiagnosticsConfig, {"observations": -1}),
-        ("diagnostics", DiagnosticsConfig, {"samples": 1}),
-        ("diagnostics", DiagnosticsConfig, {"neighbours": 0}),
-        ("diagnostics", DiagnosticsConfig, {"states": 3}),
-        ("diagnostics", DiagnosticsConfig, {"epsilon": 0.0}),
-    ],
-)
-def test_wrong_flags_are_named(group, kind, options):
-    with pytest.raises(ValueError, match=f"--policy.collect.{group}.{next(iter(options))}"):
-        kind(**options)
+WRONG = [
+    "teacher.num_inference_steps=0",
+    "guidance.scale=-1",
+    "guidance.max_scale=0",
+    "collect.every=-1",
+    "collect.warmup=0",
+    "collect.episodes=0",
+    "collect.n_envs=0",
+    "collect.rounds=-1",
+    "collect.teacher_only_fraction=1.5",
+    "collect.retry_fraction=-0.5",
+    "collect.n_action_steps=0",
+    "collect.n_action_steps=101",
+    "collect.push_to_hub=true",
+    "collect.mixing.weight=1.1",
+    "replay.collected_fraction=1.0",
+    "adversary.weight=-1",
+    "adversary.start=-1",
+    "adversary.every=0",
+    "adversary.lr=0",
+]
+UNKNOWN = [
+    "teacher.noise_scheduler=EDM",
+    "guidance.at=x1",
+    "representation.type=pixels",
+    "collect.strategy=dagger",
+    "collect.mixing.form=add",
+    "replay.relabel=some",
+]
 
 
-@pytest.mark.parametrize("strategy", ["replay", "mixing"])
-@pytest.mark.parametrize("options", [{"quantile": 0.5}, {"scale_spread": 2.0}])
-def test_variation_of_guidance_needs_guidance(strategy, options):
-    with pytest.raises(ValueError, match=f"strategy={strategy}.*strategy=guided or rollin"):
-        CollectConfig(strategy=strategy, variation=VariationConfig(**options))
-    assert CollectConfig(strategy="rollin", variation=VariationConfig(**options)).guides
+def parse(*flags) -> TrainPipelineConfig:
+    """What `lerobot-train` makes of `--policy.*` flags."""
+    args = ["--dataset.repo_id=local/small", "--policy.type=agpd", "--policy.device=cpu"]
+    return draccus.parse(TrainPipelineConfig, args=[*args, *(f"--policy.{flag}" for flag in flags)])
 
 
-@dataclass
-class Command:
-    collect: CollectConfig = field(default_factory=CollectConfig)
+@pytest.mark.parametrize("flag", WRONG)
+def test_wrong_values_are_refused_in_words_that_reach_the_command_line(flag):
+    with pytest.raises(FlagError) as refusal:
+        parse(flag)
+    name, value = flag.split("=")
+    assert f"--policy.{name}" in str(refusal.value)
+    assert value.rstrip("0").rstrip(".") in str(refusal.value)
+
+
+@pytest.mark.parametrize("flag", UNKNOWN)
+def test_unknown_choices_are_refused(flag):
+    name, value = flag.split("=")
+    with pytest.raises(ParsingError, match=value) as refusal:
+        parse(flag)
+    assert name.rsplit(".", 1)[1] in str(refusal.value)
+
+
+def test_defaults_are_valid_and_every_group_is_a_flag():
+    assert isinstance(parse().policy, AGPDConfig)
+    names = ("teacher", "guidance", "representation", "collect", "replay", "adversary")
+    kinds = {type(getattr(parse().policy, name)) for name in names}
+    declared = {kind for name, kind in vars(groups).items() if name.endswith("Config") and kind in kinds}
+    assert kinds == declared
 
 
 def test_flags_parse_and_round_trip():
-    flags = ["--collect.strategy=mixing", "--collect.mixing.form=switch", "--collect.mixing.relabel=true"]
-    config = draccus.parse(Command, args=[*flags, "--collect.diagnostics.observations=0"])
-    expected = CollectConfig(
-        strategy="mixing",
-        mixing=MixingConfig(form="switch", relabel=True),
-        diagnostics=DiagnosticsConfig(observations=0),
-    )
-    assert config.collect == expected
-    encoded = json.loads(json.dumps(draccus.encode(config)))
-    assert draccus.decode(Command, encoded) == config
-
-
-def test_flags_of_older_checkpoints_still_load():
-    encoded = draccus.encode(Command())
-    for name in ("mixing", "rollin", "variation", "diagnostics"):
-        del encoded["collect"][name]
-    assert draccus.decode(Command, encoded) == Command()
+    policy = parse(
+        "collect.strategy=mixing", "collect.mixing.form=switch", "collect.mixing.weight=0.5"
+    ).policy
+    assert policy.collect == CollectConfig(strategy="mixing", mixing=MixingConfig(form="switch", weight=0.5))
+    encoded = json.loads(json.dumps(draccus.encode(policy.collect)))
+    assert draccus.decode(CollectConfig, encoded) == policy.collect

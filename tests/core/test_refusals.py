@@ -1,144 +1,32 @@
-"""What a user can get wrong, and whether the error names the flag, what was found and what would be right."""
+"""What a user can get wrong: each refusal names both sides, when the policy is built and not later."""
 
-from contextlib import nullcontext
+import json
+import logging
 
 import pytest
-import torch
 from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import PushtEnv
-from lerobot.policies import make_pre_post_processors
-from small_environment import FittingEnv
+from point_environment import PointEnv
 
-from lerobot_agpd.collect.config import CollectConfig, MixingConfig
-from lerobot_agpd.distill.environment import check_environment_fits, run_environment
-from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
-from lerobot_agpd.guidance.config import GuidanceConfig, RepresentationConfig, TeacherConfig
-from lerobot_agpd.guidance.loading import load_teacher
+from lerobot_agpd.config import (
+    CollectConfig,
+    FlagError,
+    GuidanceConfig,
+    MixingConfig,
+    ReplayConfig,
+    RepresentationConfig,
+    TeacherConfig,
+)
+from lerobot_agpd.loading import check_fit, collection_environment, load_teacher, read_policy_config
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
 from lerobot_agpd.policies.agpd_diffusion.modeling_agpd_diffusion import AGPDDiffusionPolicy
-from lerobot_agpd.run import RunInfo, declared_run
+from lerobot_agpd.run import RunInfo
+
+ENV_KEY = "observation.environment_state"
 
 
-def train_step(config, dataset: LeRobotDataset, run: RunInfo) -> None:
-    """The first forward of `lerobot-train` on two frames of the dataset."""
-    policy = AGPDPolicy(config, dataset_stats=dataset.meta.stats, dataset_meta=dataset.meta).train()
-    preprocessor, _ = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
-    frames = torch.utils.data.default_collate([dataset[0], dataset[6]])
-    with declared_run(run):
-        policy.forward(preprocessor(frames))
-
-
-def test_no_teacher(agpd_config, demonstrations):
-    with pytest.raises(ValueError, match=r"--policy.teacher.path is not set.*--policy.collect.every=0"):
-        train_step(agpd_config(), demonstrations, RunInfo(env=PushtEnv()))
-
-
-def test_teacher_path_without_a_policy(tmp_path):
-    with pytest.raises(FileNotFoundError, match="--policy.teacher.path=.*neither a folder"):
-        load_teacher(TeacherConfig(path=str(tmp_path)), "cpu")
-
-
-def test_guiding_a_teacher_that_does_not_denoise(tmp_path, agpd_config, demonstrations):
-    config = agpd_config()
-    AGPDPolicy(config).save_pretrained(tmp_path / "act")
-    for processor in make_pre_post_processors(config, dataset_stats=demonstrations.meta.stats):
-        processor.save_pretrained(tmp_path / "act")
-    config = agpd_config(teacher=TeacherConfig(path=str(tmp_path / "act")))
-    with pytest.raises(ValueError, match=r"'agpd' teacher .*no denoising to guide.*strategy=replay"):
-        train_step(config, demonstrations, RunInfo(env=PushtEnv()))
-
-
-def test_teacher_with_other_observations(agpd_config, demonstrations, save_teacher, input_features):
-    wider = {**input_features, "observation.environment_state": PolicyFeature(FeatureType.ENV, (16,))}
-    config = agpd_config(teacher=TeacherConfig(path=str(save_teacher(inputs=wider))))
-    with pytest.raises(ValueError, match=r"the teacher .* needs .*\(16,\).*hold .*\(3,\)"):
-        train_step(config, demonstrations, RunInfo(env=PushtEnv()))
-
-
-def test_teacher_with_other_actions(agpd_config, demonstrations, save_teacher):
-    other = {"action": PolicyFeature(FeatureType.ACTION, (5,))}
-    config = agpd_config(teacher=TeacherConfig(path=str(save_teacher(outputs=other))))
-    with pytest.raises(
-        ValueError, match=r"the teacher's actions have shape \(5,\), the demonstrations' \(2,\)"
-    ):
-        train_step(config, demonstrations, RunInfo(env=PushtEnv()))
-
-
-def test_too_many_denoising_steps(save_teacher):
-    with pytest.raises(ValueError, match="num_inference_steps=500 exceeds the 100"):
-        load_teacher(TeacherConfig(path=str(save_teacher()), num_inference_steps=500), "cpu")
-
-
-def test_no_environment():
-    with pytest.raises(ValueError, match=r"--env.type=.*--policy.collect.env.type="):
-        run_environment(CollectConfig(), RunInfo())
-
-
-def test_the_policys_own_environment_comes_first():
-    own = PushtEnv(obs_type="environment_state_agent_pos")
-    assert run_environment(CollectConfig(env=own), RunInfo(env=GymnasiumRoboticsEnv())) is own
-
-
-def test_environment_without_the_demonstrated_observations(agpd_config, save_teacher):
-    teacher = load_teacher(TeacherConfig(path=str(save_teacher())), "cpu")
-    pixels = PushtEnv(obs_type="pixels_agent_pos")
-    with pytest.raises(
-        ValueError, match=r"\['observation.environment_state'\] is missing \(check --env.obs_type"
-    ):
-        check_environment_fits(pixels, agpd_config(), teacher)
-
-
-def test_environment_with_other_shapes(agpd_config, save_teacher):
-    teacher = load_teacher(TeacherConfig(path=str(save_teacher())), "cpu")
-    keypoints = PushtEnv(obs_type="environment_state_agent_pos")  # 16 numbers; the demonstrations have 3
-    with pytest.raises(
-        ValueError, match=r"'observation.environment_state' has shape \(3,\).*\(16,\).*'pusht'"
-    ):
-        check_environment_fits(keypoints, agpd_config(), teacher)
-
-
-def test_more_executed_steps_than_the_student_predicts(agpd_config):
-    with pytest.raises(ValueError, match=r"--policy.collect.n_action_steps=9 exceeds.*--policy.chunk_size=8"):
-        agpd_config(collect=CollectConfig(n_action_steps=9))
-
-
-def test_resuming_without_the_collected_episodes(agpd_config, demonstrations, save_teacher, tmp_path):
-    checkpoint = tmp_path / "run" / "checkpoints" / "000001" / "pretrained_model"
-    checkpoint.mkdir(parents=True)
-    (checkpoint / "agpd_state.json").write_text('{"updates": 5, "rounds": 2, "seen_episodes": []}')
-    config = agpd_config(
-        teacher=TeacherConfig(path=str(save_teacher())), collect=CollectConfig(env=FittingEnv())
-    )
-    config.pretrained_path = checkpoint
-    policy = AGPDPolicy(config, dataset_meta=demonstrations.meta)
-    run = RunInfo(resume=True, output_dir=tmp_path / "elsewhere")
-    with (
-        declared_run(run),
-        pytest.raises(FileNotFoundError, match=r"used 2 collection rounds.*holds 0.*--policy.replay.root"),
-    ):
-        policy.distillation  # noqa: B018
-
-
-@pytest.mark.parametrize(
-    ("group", "options", "flag"),
-    [
-        (CollectConfig, {"strategy": "magic"}, "--policy.collect.strategy"),
-        (CollectConfig, {"episodes": 0}, "--policy.collect.episodes"),
-        (CollectConfig, {"unguided_fraction": 1.5}, "--policy.collect.unguided_fraction"),
-        (CollectConfig, {"push_to_hub": True}, "--policy.collect.repo_id"),
-        (GuidanceConfig, {"scale": -1.0}, "--policy.guidance.scale"),
-        (GuidanceConfig, {"at": "eps"}, "--policy.guidance.at"),
-        (GuidanceConfig, {"growth": 1.0}, "--policy.guidance.growth"),
-        (TeacherConfig, {"noise_scheduler": "Euler"}, "--policy.teacher.noise_scheduler"),
-    ],
-)
-def test_flags_are_checked_when_parsed(group, options, flag):
-    with pytest.raises(ValueError, match=flag):
-        group(**options)
-
-
-# ---- numbers of executed steps ----
+def collect(**options) -> CollectConfig:
+    return CollectConfig(env=PointEnv(), **options)
 
 
 @pytest.fixture
@@ -146,116 +34,195 @@ def guided_config(agpd_config, save_teacher):
     """An ACT student of the small teacher, which executes 8 steps; the student's chunk has 8, and it executes 4."""
 
     def config(**options):
-        options = {"collect": CollectConfig(env=FittingEnv()), "n_action_steps": 4, **options}
-        return agpd_config(teacher=TeacherConfig(path=str(save_teacher())), **options)
+        return agpd_config(**{"teacher": save_teacher(), "collect": collect(), **options})
 
     return config
 
 
-def test_a_representation_that_looks_as_far_ahead_as_rounds_execute(guided_config, demonstrations, tmp_path):
-    config = guided_config(representation=RepresentationConfig(type="state", width=16, n_heads=2))
-    train_step(config, demonstrations, RunInfo(output_dir=tmp_path))
+# ---- the teacher ----
 
 
-def test_a_representation_that_looks_further_ahead_than_rounds_execute(
-    guided_config, demonstrations, tmp_path
-):
-    config = guided_config(
-        n_action_steps=8,
-        chunk_size=16,
-        representation=RepresentationConfig(type="state", width=16, n_heads=2),
-    )
-    config.n_action_steps = 16  # the teacher executes 8
-    with pytest.raises(
-        ValueError, match=r"predicts 16 steps ahead.*execute 8.*--policy.collect.n_action_steps=8"
-    ):
-        train_step(config, demonstrations, RunInfo(output_dir=tmp_path))
-
-
-def test_a_representation_without_a_future_to_learn_from(guided_config, demonstrations, tmp_path):
-    config = guided_config(representation=RepresentationConfig(type="state", width=16, n_heads=2))
-    config.collect = CollectConfig(env=FittingEnv(), n_action_steps=7)
-    with pytest.raises(ValueError, match=r"predicts 7 steps ahead, and no demonstration is longer than 7"):
-        train_step(config, demonstrations, RunInfo(output_dir=tmp_path))
-
-
-def test_a_representation_of_actions_that_were_not_executed(guided_config, demonstrations, tmp_path):
-    config = guided_config(
-        representation=RepresentationConfig(type="state", width=16, n_heads=2),
-        collect=CollectConfig(env=FittingEnv(), strategy="mixing", mixing=MixingConfig(relabel=True)),
-    )
-    with pytest.raises(ValueError, match=r"--policy.collect.mixing.relabel=true records actions"):
-        train_step(config, demonstrations, RunInfo(output_dir=tmp_path))
-
-
-def test_more_executed_steps_than_a_diffusion_student_returns(
-    agpd_diffusion_config, demonstrations, save_teacher, tmp_path
-):
-    """LeRobot's diffusion policy predicts 8 steps here and returns those that it would execute."""
-    config = agpd_diffusion_config(
-        teacher=TeacherConfig(path=str(save_teacher())),
-        collect=CollectConfig(env=FittingEnv(), n_action_steps=6),
-    )
-    assert config.n_action_steps < 6
-    policy = AGPDDiffusionPolicy(config, demonstrations.meta.stats, demonstrations.meta)
-    with (
-        declared_run(RunInfo(output_dir=tmp_path)),
-        pytest.raises(ValueError, match=r"n_action_steps=6 exceeds.*the student \d, the teacher 15"),
-    ):
-        policy.distillation  # noqa: B018
-
-
-# ---- collection ----
-
-
-def test_rollin_without_guidance_takes_any_teacher(agpd_config, demonstrations, tmp_path):
-    config = agpd_config()
-    AGPDPolicy(config).save_pretrained(tmp_path / "act")
-    for processor in make_pre_post_processors(config, dataset_stats=demonstrations.meta.stats):
-        processor.save_pretrained(tmp_path / "act")
-    teacher = TeacherConfig(path=str(tmp_path / "act"))
-    collect = CollectConfig(env=FittingEnv(), strategy="rollin")
-    for scale, refused in ((0.0, False), (0.5, True)):
-        config = agpd_config(teacher=teacher, collect=collect, guidance=GuidanceConfig(scale=scale))
-        with pytest.raises(ValueError, match="no denoising to guide") if refused else nullcontext():
-            train_step(config, demonstrations, RunInfo(output_dir=tmp_path))
+def test_no_policy_at_the_teachers_path(tmp_path):
+    with pytest.raises(FileNotFoundError, match=f"--policy.teacher.path='{tmp_path}'"):
+        load_teacher(TeacherConfig(path=str(tmp_path)), "cpu")
+    with pytest.raises(FileNotFoundError, match="--policy.path='nowhere/x'"):
+        read_policy_config("nowhere/x", "--policy.path")
 
 
 @pytest.mark.parametrize(
-    ("collect", "said"),
+    ("strategy", "scale", "refused"),
+    [("guided", 0.5, True), ("rollin", 0.5, True), ("rollin", 0.0, False), ("teacher", 0.5, False)],
+)
+def test_a_teacher_that_does_not_denoise_cannot_be_guided(
+    build, agpd_config, save_policy, strategy, scale, refused
+):
+    config = agpd_config(
+        teacher=save_policy(AGPDPolicy(agpd_config())),
+        collect=collect(strategy=strategy),
+        guidance=GuidanceConfig(scale=scale),
+    )
+    if not refused:
+        build(config)
+        return
+    with pytest.raises(FlagError, match="'agpd' teacher.*--policy.collect.strategy=teacher"):
+        build(config)
+
+
+# ---- what must fit together ----
+
+
+@pytest.fixture
+def wide():
+    return PolicyFeature(FeatureType.ENV, (16,))
+
+
+def test_a_teacher_with_other_observations(build, agpd_config, save_teacher, input_features, wide):
+    config = agpd_config(
+        teacher=save_teacher(inputs={**input_features, ENV_KEY: wide}), collect=CollectConfig(every=0)
+    )
+    with pytest.raises(FlagError) as refusal:
+        build(config)
+    for part in ("--policy.teacher.path", "(16,)", "--dataset.*", "(3,)", f"differ in ['{ENV_KEY}']"):
+        assert part in str(refusal.value)
+
+
+def test_a_teacher_with_other_actions(build, agpd_config, save_teacher):
+    five = {"action": PolicyFeature(FeatureType.ACTION, (5,))}
+    with pytest.raises(FlagError, match=r"--policy.teacher.path.*\(5,\), the student's \(2,\)"):
+        build(agpd_config(teacher=save_teacher(outputs=five), collect=collect()))
+
+
+def test_no_environment(build, agpd_config, save_teacher):
+    with pytest.raises(FlagError, match=r"--env.type=.*--policy.collect.env.type=.*--policy.collect.every=0"):
+        build(agpd_config(teacher=save_teacher()))
+
+
+def test_the_policys_own_environment_comes_first():
+    own, other = PointEnv(), PushtEnv()
+    assert collection_environment(CollectConfig(env=own), RunInfo(env=other)) is own
+    assert collection_environment(CollectConfig(), RunInfo(env=other)) is other
+
+
+def test_an_environment_without_the_demonstrated_observations(build, guided_config):
+    pixels = CollectConfig(env=PushtEnv(obs_type="pixels_agent_pos"))
+    with pytest.raises(FlagError, match=rf"student observes.*'pusht' delivers.*{ENV_KEY}.*--env.obs_type"):
+        build(guided_config(collect=pixels))
+
+
+def test_an_environment_with_other_shapes(build, guided_config):
+    keypoints = CollectConfig(env=PushtEnv(obs_type="environment_state_agent_pos"))
+    with pytest.raises(FlagError, match=rf"'{ENV_KEY}' has shape \(3,\).*--dataset.*\(16,\).*'pusht'"):
+        build(guided_config(collect=keypoints))
+
+
+def test_an_environment_with_other_actions(build, guided_config):
+    env = PointEnv()
+    env.features["action"] = PolicyFeature(FeatureType.ACTION, (7,))
+    with pytest.raises(FlagError, match=r"'action' has shape \(2,\).*\(7,\).*'agpd_test_point'"):
+        build(guided_config(collect=CollectConfig(env=env)))
+
+
+def test_an_environment_at_another_rate(build, guided_config):
+    with pytest.raises(FlagError, match=r"--dataset.*at 10 frames.*--env.fps\) runs at 25"):
+        build(guided_config(collect=CollectConfig(env=PointEnv(fps=25))))
+
+
+def test_a_teacher_and_an_environment_without_demonstrations(agpd_config, save_teacher, input_features, wide):
+    """As in commands that roll out what was trained."""
+    teacher = load_teacher(save_teacher(), "cpu")
+    config = agpd_config()
+    check_fit(config, teacher, env_config=PointEnv())
+    other = load_teacher(save_teacher(inputs={**input_features, ENV_KEY: wide}), "cpu")
+    with pytest.raises(FlagError, match=r"\(16,\).*'agpd_test_point' \(--env.*\(3,\)"):
+        check_fit(config, other, env_config=PointEnv())
+    more = load_teacher(save_teacher(inputs={**input_features, "observation.effort": wide}), "cpu")
+    with pytest.raises(FlagError, match=r"teacher observes.*'agpd_test_point'.*observation.effort"):
+        check_fit(config, more, env_config=PointEnv())
+
+
+# ---- numbers of executed steps ----
+
+
+def test_a_representation_that_looks_as_far_ahead_as_rounds_execute(build, guided_config):
+    build(guided_config(representation=RepresentationConfig("state")))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
     [
-        ({"keep_failures": True}, "--policy.replay.relabel=none: the student imitates the failures"),
-        ({"episodes": 4}, "less than one episode"),
+        (
+            {"n_action_steps": 16, "chunk_size": 16},  # the teacher executes 8
+            "predicts 16 steps ahead.*execute 8.*--policy.collect.n_action_steps=8",
+        ),
+        ({"collect": collect(n_action_steps=7)}, "7 steps ahead.*no demonstration is longer than 7"),
+        (
+            {"collect": collect(strategy="mixing", mixing=MixingConfig(record_teacher=True))},
+            "--policy.collect.mixing.record_teacher=true",
+        ),
     ],
 )
-def test_what_is_allowed_and_seldom_wanted_is_said(
-    guided_config, demonstrations, tmp_path, caplog, collect, said
-):
-    config = guided_config(collect=CollectConfig(env=FittingEnv(), **collect))
-    train_step(config, demonstrations, RunInfo(output_dir=tmp_path))
-    assert said in caplog.text
+def test_a_representation_that_could_not_be_learned(build, guided_config, options, message):
+    with pytest.raises(FlagError, match=message):
+        build(guided_config(representation=RepresentationConfig("state"), **options))
 
 
-def test_failures_whose_actions_are_the_teachers_need_no_warning(
-    guided_config, demonstrations, tmp_path, caplog
-):
-    mixing = MixingConfig(relabel=True)
-    collect = CollectConfig(env=FittingEnv(), strategy="mixing", mixing=mixing, keep_failures=True)
-    train_step(guided_config(collect=collect), demonstrations, RunInfo(output_dir=tmp_path))
-    assert "imitates the failures" not in caplog.text
+def test_more_executed_steps_than_a_diffusion_student_returns(build, agpd_diffusion_config, save_teacher):
+    """LeRobot's diffusion policy predicts 8 steps here and returns the 4 that it would execute."""
+    config = agpd_diffusion_config(teacher=save_teacher(), collect=collect(n_action_steps=6))
+    with pytest.raises(FlagError, match=r"n_action_steps=6 .*the student 4, the teacher 15"):
+        policy = build(config, AGPDDiffusionPolicy)
+        policy.agpd.collect_round()
+
+
+# ---- what is allowed and seldom intended ----
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("seed", 7), ("strategy", "replay"), ("teacher", "elsewhere"), ("environment", None)]
+    ("options", "flag"),
+    [
+        ({"keep_failures": True}, "--policy.replay.relabel=none"),
+        ({"keep_failures": True, "strategy": "mixing", "mixing": MixingConfig(record_teacher=True)}, None),
+        ({"episodes": 4}, "--policy.collect.teacher_only_fraction=0.2"),
+        ({"episodes": 4, "strategy": "teacher"}, None),
+        ({}, None),
+    ],
 )
-def test_rounds_of_another_run_are_not_adopted(guided_config, demonstrations, tmp_path, name, value):
+def test_warnings(build, guided_config, caplog, options, flag):
+    caplog.set_level(logging.WARNING)
+    build(guided_config(collect=collect(**options)))
+    warnings = [record.getMessage() for record in caplog.records if "build" in record.name]
+    assert [flag in warning for warning in warnings] == ([] if flag is None else [True])
+
+
+# ---- the folder of episodes ----
+
+
+def test_episodes_of_another_run_are_not_adopted(build, guided_config, tmp_path):
+    first = build(guided_config())
+    build(guided_config())  # the same run again
+    with pytest.raises(ValueError, match="another run.*strategy 'guided' instead of 'teacher'.*replay.root"):
+        build(guided_config(collect=collect(strategy="teacher")))
+    elsewhere = guided_config(collect=collect(strategy="teacher"), replay=ReplayConfig(str(tmp_path / "x")))
+    assert build(elsewhere).agpd.journal.root == tmp_path / "x" != first.agpd.journal.root
+
+
+@pytest.mark.parametrize(
+    ("state", "error", "message"),
+    [
+        (None, FileNotFoundError, "agpd_state.json is missing.*--policy.path"),
+        ({"updates": 5}, ValueError, "another version"),
+        (
+            {"step": 5, "rounds": 2, "replay_root": None, "seen_episodes": []},
+            FileNotFoundError,
+            "2 collection rounds.*holds 0.*--policy.replay.root",
+        ),
+    ],
+)
+def test_a_run_that_cannot_be_resumed(build, guided_config, tmp_path, state, error, message):
     config = guided_config()
-    policy = AGPDPolicy(config, dataset_meta=demonstrations.meta)
-    with declared_run(RunInfo(output_dir=tmp_path)):
-        rounds = policy.distillation.rounds
-    rounds.check_own(rounds.identity)
-    rounds.check_own(
-        {key: entry for key, entry in rounds.identity.items() if key != "seed"}
-    )  # an older one's
-    with pytest.raises(ValueError, match=rf"another run \({name} .* instead of .*--policy.replay.root"):
-        rounds.check_own(rounds.identity | {name: value})
+    config.pretrained_path = tmp_path / "run" / "checkpoints" / "000001" / "pretrained_model"
+    build(guided_config()).save_pretrained(config.pretrained_path)
+    file = config.pretrained_path / "agpd_state.json"
+    file.unlink() if state is None else file.write_text(json.dumps(state))
+    with pytest.raises(error, match=message):
+        build(config, resume=True)

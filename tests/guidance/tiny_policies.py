@@ -1,4 +1,4 @@
-"""Tiny, randomly initialised teachers of LeRobot's own classes, and the raw observations they look at."""
+"""Tiny, randomly initialized teachers of LeRobot's own classes, and the raw observations they look at."""
 
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
