@@ -15,7 +15,7 @@ from toy_policies import NoisyTeacher
 
 NAME = "lerobot_agpd_tests/Point-v0"
 FPS, LIMIT, REACHED, GAIN = 10, 12, 0.25, 0.3
-EPISODE_LENGTH = 6  # of the teacher alone: with two steps per decision the distance is 1, 0.7, 0.4, .28, .16
+EPISODE_LENGTH = 4  # of the teacher alone, two steps per decision: its distance is 1, .7, .4, .28, .16
 
 
 class Point(gym.Env):

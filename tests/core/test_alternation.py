@@ -39,7 +39,7 @@ class Run:
     def __init__(self, policy: AGPDPolicy, dataset):
         self.policy, self.dataset, self.logs = policy.train(), dataset, []
         self.optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=1e-4)
-        self.preprocess, _ = make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats)
+        self.processors = make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats)
 
     @property
     def agpd(self):
@@ -47,7 +47,7 @@ class Run:
 
     def batch(self):
         frames = torch.utils.data.default_collate([self.dataset[n] for n in range(0, len(self.dataset), 2)])
-        return self.preprocess(frames)
+        return self.processors[0](frames)
 
     def train(self, until: int) -> "Run":
         """Train until so many steps are done."""
@@ -65,7 +65,8 @@ class Run:
     def save(self) -> "Run":
         """Save a checkpoint where LeRobot would."""
         self.policy.save_pretrained(self.checkpoint)
-        self.preprocess.save_pretrained(self.checkpoint)
+        for processor in self.processors:
+            processor.save_pretrained(self.checkpoint)
         return self
 
     @property
@@ -82,6 +83,7 @@ def start(agpd_config, point_demonstrations, tmp_path):
     """Starts a run, or continues one from its checkpoint; `facts` are those of the run."""
 
     def start(checkpoint=None, collect=None, guidance=None, **facts) -> Run:
+        torch.manual_seed(0)
         config = agpd_config(
             teacher=TeacherConfig(path="a/toy"),
             guidance=GuidanceConfig(**{"scale": SCALE, **(guidance or {})}),
@@ -92,6 +94,7 @@ def start(agpd_config, point_demonstrations, tmp_path):
                     "every": 3,
                     "episodes": EPISODES,
                     "n_envs": 3,
+                    "diagnostics": False,
                     "teacher_only_fraction": TEACHER_ONLY / EPISODES,
                     **(collect or {}),
                 }
@@ -120,7 +123,7 @@ def episodes_on_disk(agpd) -> dict[str, np.ndarray]:
 
 
 def test_the_alternation(start, toy_teacher):
-    run = start()
+    run = start(collect={"diagnostics": True})
     agpd, n_demonstrated = run.agpd, run.agpd.replay.n_demonstration_frames
 
     run.train(until=2)

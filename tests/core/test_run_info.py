@@ -84,11 +84,11 @@ def test_image_transforms_are_the_loaders(train_config):
     [
         ("accelerator", {"gradient_accumulation": SimpleNamespace(steps=4)}, {"steps_per_update": 4}),
         ("accelerator", {}, {"steps_per_update": 1}),
-        ("ema", {"enable": True}, {"averages_weights": True}),
-        ("ema", {"enable": False}, {"averages_weights": False}),
-        ("parallelism", {"dp_shard": 2}, {"shards_weights": True}),
-        ("parallelism", {"dp_shard": 1}, {"shards_weights": False}),
-        ("parallelism", {}, {"shards_weights": False}),
+        ("ema", {"enable": True}, {"lerobot_ema": True}),
+        ("ema", {"enable": False}, {"lerobot_ema": False}),
+        ("parallelism", {"dp_shard": 2}, {"sharded": True}),
+        ("parallelism", {"dp_shard": 1}, {"sharded": False}),
+        ("parallelism", {}, {"sharded": False}),
     ],
 )
 def test_settings_of_later_lerobots(train_config, group, value, fact):
@@ -100,7 +100,7 @@ def test_settings_of_later_lerobots(train_config, group, value, fact):
 def test_sharded_weights_are_refused(agpd_config, demonstrations):
     config = agpd_config(collect=CollectConfig(every=0), adversary=AdversaryConfig(weight=0))
     with pytest.raises(FlagError, match="--parallelism"):
-        AGPDPolicy(config, dataset_meta=demonstrations.meta, run=RunInfo(shards_weights=True))
+        AGPDPolicy(config, dataset_meta=demonstrations.meta, run=RunInfo(sharded=True))
 
 
 def test_resume_is_told(train_config):
