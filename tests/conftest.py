@@ -50,7 +50,7 @@ def agpd_diffusion_config(input_features, output_features):
 
     def build(**options):
         sizes = {"horizon": 8, "n_action_steps": 4, "drop_n_last_frames": 3, "num_inference_steps": 4}
-        network = {"denoiser": "mlp", "mlp": MLPDenoiserConfig(width=16, n_blocks=1, time_embed_dim=8)}
+        network = {"denoiser": "mlp", "mlp": MLPDenoiserConfig(width=16, n_blocks=1)}
         features = {"input_features": dict(input_features), "output_features": dict(output_features)}
         common = {"noise_scheduler_type": "DDIM", "device": "cpu", "push_to_hub": False}
         return AGPDDiffusionConfig(**{**sizes, **network, **features, **common, **options})

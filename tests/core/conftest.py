@@ -40,7 +40,7 @@ def save_teacher(save_policy, input_features, output_features):
         config = DiffusionTransformerConfig(
             input_features=inputs or dict(input_features),
             output_features=outputs or dict(output_features),
-            mlp=MLPDenoiserConfig(width=8, n_blocks=1, time_embed_dim=4),
+            mlp=MLPDenoiserConfig(width=8, n_blocks=1),
             num_inference_steps=2,
             noise_scheduler_type="DDIM",
             device="cpu",

@@ -172,7 +172,7 @@ def test_the_student_moves_toward_the_teacher():
     discriminator, _ = train_discriminator()
     chunk, teacher_chunk = torch.full((1, N, A), 0.5), torch.full((1, N, A), -0.5)
     gaps = []
-    for _ in range(40):
+    for _ in range(10):
         chunk = chunk.detach().requires_grad_()
         terms = adversary_terms(discriminator, chunk, teacher_chunk, torch.zeros(1, E), weight=1.0)
         chunk = chunk - 0.2 * torch.autograd.grad(terms.loss, chunk)[0]

@@ -209,7 +209,7 @@ def test_a_chunk_teacher_cannot_be_guided(act):
 
 
 def test_a_policy_with_a_history_of_its_own_needs_an_adapter():
-    with pytest.raises(ValueError, match="'vqbet' teacher looks at 5 observations.*docs/teachers.md"):
+    with pytest.raises(FlagError, match="'vqbet' teacher looks at 5 observations.*docs/teachers.md"):
         make_teacher("vqbet", WITH_CAMERA, crop_shape=None, pretrained_backbone_weights=None, gpt_n_layer=1)
 
 
