@@ -1,20 +1,27 @@
 """The alternation: warm-up, rounds, T grows, the scale adapts; then resumed, interrupted, finished."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 from point_environment import EPISODE_LENGTH, PointEnv, PointTeacher, demonstrate
 from small_dataset import create_dataset
 
 from lerobot_agpd import agpd as algorithm, build as builders
-from lerobot_agpd.config import AdversaryConfig, CollectConfig, GuidanceConfig, TeacherConfig
+from lerobot_agpd.agpd import make_strategy
+from lerobot_agpd.config import AdversaryConfig, CollectConfig, GuidanceConfig, MixingConfig, TeacherConfig
 from lerobot_agpd.guidance.representation import StateRepresentation
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
-from lerobot_agpd.replay.export import MERGED, merge
+from lerobot_agpd.replay.export import MERGED
+from lerobot_agpd.replay.normalization import Normalizer
 from lerobot_agpd.replay.replay import FRAME_INDEX
+from lerobot_agpd.rollout.collector import Collector
 from lerobot_agpd.rollout.report import success_rate
 from lerobot_agpd.run import RunInfo
+from lerobot_agpd.student import StudentSampler
 
 STEPS, EPISODES, TEACHER_ONLY, SCALE = 10, 6, 2, 0.25
 ROUND_STEPS = [3, 6, 9]
@@ -123,7 +130,7 @@ def episodes_on_disk(agpd) -> dict[str, np.ndarray]:
 
 
 def test_the_alternation(start, toy_teacher):
-    run = start(collect={"diagnostics": True})
+    run = start()
     agpd, n_demonstrated = run.agpd, run.agpd.replay.n_demonstration_frames
 
     run.train(until=2)
@@ -162,7 +169,7 @@ def test_the_alternation(start, toy_teacher):
 
     merged = agpd.journal.root / MERGED
     assert merged.is_dir(), "the last step merges all kept episodes"
-    dataset = merge(agpd.journal.root)
+    dataset = LeRobotDataset("local/merged", root=merged)
     assert dataset.num_frames == agpd.replay.n_collected_frames
     assert set(dataset.features) >= {"observation.state", "action", "agpd.round", "agpd.strength"}
     n_kept = sum(report.total.kept for report in agpd.reports)
@@ -178,12 +185,22 @@ def test_a_round_leaves_random_numbers_and_mode_as_they_were(start):
         assert torch.equal(torch.get_rng_state(), before) and run.policy.training is mode
 
 
-def test_rounds_repeat_bit_for_bit(start, tmp_path):
-    first, second = (start(output_dir=tmp_path / name).train(until=4).agpd for name in ("a", "b"))
+@pytest.mark.parametrize("strategy", ["teacher", "guided", "mixing", "rollin"])
+def test_rounds_repeat_bit_for_bit_and_diagnostics_change_nothing(start, tmp_path, strategy):
+    collect = {"strategy": strategy, "mixing": MixingConfig(form="switch"), "episodes": 3}
+    first, second = (
+        start(output_dir=tmp_path / str(measured), collect={**collect, "diagnostics": measured}, steps=4)
+        .train(until=4)
+        .agpd
+        for measured in (True, False)
+    )
+    assert [repr(r) for r in first.journal.records(0)] == [repr(r) for r in second.journal.records(0)]
     ours, theirs = (list(episodes_on_disk(agpd).values()) for agpd in (first, second))
     assert len(ours) == len(theirs) > 0
-    for mine, yours in zip(ours, theirs, strict=True):
-        assert mine.tobytes() == yours.tobytes()
+    assert all(mine.tobytes() == yours.tobytes() for mine, yours in zip(ours, theirs, strict=True))
+    measured = first.reports[0].diagnostics
+    assert (measured.actions["rms_to_teacher"] == 0) == (strategy == "teacher")
+    assert measured.states["dim"] == 5 and second.reports[0].diagnostics is None
 
 
 def test_a_fixed_scale_stays(start):
@@ -191,12 +208,14 @@ def test_a_fixed_scale_stays(start):
     assert [report.strength for report in run.agpd.reports] == [SCALE, SCALE]
 
 
-@pytest.mark.parametrize("strategy", ["teacher", "mixing", "rollin"])
-def test_every_strategy_fills_the_replay(start, strategy):
-    run = start(collect={"strategy": strategy}, steps=4).train(until=4)
+@pytest.mark.parametrize(
+    ("strategy", "strengths"),
+    [("teacher", {0.0}), ("mixing", {0.0, 0.3}), ("rollin", {0.0, SCALE})],
+)
+def test_every_strategy_fills_the_replay(start, strategy, strengths):
+    run = start(collect={"strategy": strategy}, steps=4).train(until=3)
     (report,) = run.agpd.reports
-    strengths = {record.strength for record in run.records(0)}
-    assert strengths == {"teacher": {0.0}, "mixing": {0.0, 0.3}, "rollin": {0.0, SCALE}}[strategy]
+    assert {record.strength for record in run.records(0)} == strengths
     assert report.kept_frames == run.agpd.replay.n_collected_frames > 0
     assert (report.next_scale != SCALE) == (strategy == "rollin"), "guidance alone adapts"
 
@@ -208,6 +227,66 @@ def test_a_learned_discrepancy_guides_too(start, point_demonstrations, agpd_conf
     run.train(until=4)
     (report,) = run.agpd.reports
     assert report.mean_guidance_shift > 0 and run.logs[-1]["representation_loss"] > 0
+
+
+def test_the_next_round_starts_again_where_the_last_one_failed(start, monkeypatch):
+    failing, classify = set(), algorithm.classify
+
+    def failing_there(episode, config):
+        record = classify(episode, config)
+        failed = record.number in (0, 2, 3) and not record.retry
+        if failed:
+            failing.add(record.seed)
+        return replace(record, success=not failed, kept=not failed)
+
+    monkeypatch.setattr(algorithm, "classify", failing_there)
+    run = start(collect={"retry_fraction": 0.5}).train(until=3)
+    assert not any(record.retry for record in run.records(0))
+    first = set(failing)
+    run.train(until=6)
+    retried = [record.seed for record in run.records(1) if record.retry]
+    assert len(retried) == EPISODES // 2 and set(retried) == first
+    assert run.agpd.reports[1].retried.successful == EPISODES // 2
+
+
+def test_what_an_environment_delivers_is_checked_against_the_demonstrations(start):
+    """Not only what its configuration declares."""
+    with pytest.raises(ValueError, match=r"'observation.state' with shape \(7,\).*\(2,\)"):
+        start().agpd.collector.check({"observation.state": np.zeros(7)})
+
+
+def test_a_failed_upload_does_not_end_the_training(start, caplog):
+    """LeRobot writes the last checkpoint after the last update."""
+    start(collect={"push_to_hub": True, "repo_id": "nobody/nothing"}, steps=4).train(until=4)
+    assert "lerobot-agpd-merge --root=" in caplog.text
+    assert "--repo_id=nobody/nothing --push_to_hub=true" in caplog.text
+
+
+# ---- several processes ----
+
+
+def test_processes_collect_parts_of_a_round(start, point_demonstrations):
+    """Both parts are those of one round, from different starts with different noise."""
+    agpd = start().agpd
+    collectors = [
+        Collector(
+            agpd.config, PointEnv(), point_demonstrations.meta, agpd.journal, lambda _: None, 7, rank, 2
+        )
+        for rank in (0, 1)
+    ]
+    for rank, collector in enumerate(collectors):
+        sampler = StudentSampler(agpd.student, Normalizer(agpd.config, point_demonstrations.meta.stats))
+        strategy = make_strategy(agpd.config, sampler.pair_with(agpd.teacher), collector.noise(0))
+        for episode in collector.roll_out(0, SCALE, strategy, done=()):
+            agpd.journal.append(0, rank, episode, algorithm.classify(episode, agpd.config.collect))
+    parts = [agpd.journal.records(0, rank) for rank in (0, 1)]
+    assert [len(part) for part in parts] == [EPISODES // 2] * 2
+    together = agpd.journal.records(0)
+    assert [repr(record) for record in together] == [repr(record) for part in parts for record in part]
+    assert len({record.seed for record in together}) == EPISODES
+    assert sum(record.strength == 0 for record in together) == TEACHER_ONLY
+    noise = [torch.randn(3, generator=collector.noise(0)) for collector in collectors]
+    assert not torch.equal(*noise)
 
 
 # ---- gradient accumulation ----
@@ -241,7 +320,7 @@ def test_a_resumed_run_goes_on_where_its_checkpoint_was(start, tmp_path):
     assert resumed.agpd.progress.seen_episodes == [0, 1, 2]
     resumed.train(until=5), first.train(until=5)
     assert torch.equal(*(run.agpd.train_batch(run.batch())[FRAME_INDEX] for run in (first, resumed)))
-    resumed.train(until=STEPS)
+    resumed.train(until=9)
     assert [report.step for report in resumed.agpd.reports] == ROUND_STEPS
 
 
