@@ -1,7 +1,5 @@
 """Policies from checkpoints: a loaded teacher acts as before, and so does a loaded student."""
 
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -9,9 +7,7 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import make_pre_post_processors
 from point_environment import PointEnv
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "guidance"))
-from tiny_policies import (  # noqa: E402
+from tiny_policies import (
     ACT,
     ACTIONS,
     CAMERA,
@@ -24,10 +20,10 @@ from tiny_policies import (  # noqa: E402
     make_teacher,
 )
 
-from lerobot_agpd.config import FlagError, GuidanceConfig, TeacherConfig  # noqa: E402
-from lerobot_agpd.guidance.adapters.chunk import ChunkTeacher  # noqa: E402
-from lerobot_agpd.guidance.adapters.diffusion import DiffusionTeacher  # noqa: E402
-from lerobot_agpd.loading import (  # noqa: E402
+from lerobot_agpd.config import FlagError, GuidanceConfig, TeacherConfig
+from lerobot_agpd.guidance.adapters.chunk import ChunkTeacher
+from lerobot_agpd.guidance.adapters.diffusion import DiffusionTeacher
+from lerobot_agpd.loading import (
     check_fit,
     load_pair,
     load_student,
@@ -35,7 +31,7 @@ from lerobot_agpd.loading import (  # noqa: E402
     read_policy_config,
     require_student,
 )
-from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy  # noqa: E402
+from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
 
 VISION = {"crop_shape": None, "pretrained_backbone_weights": None, **DIFFUSION}
 
