@@ -1,26 +1,24 @@
 import pytest
 import torch
 
-from lerobot_agpd.guidance.config import RepresentationConfig
 from lerobot_agpd.guidance.discrepancy import ActionDiscrepancy, StateDiscrepancy, gradient
 from lerobot_agpd.guidance.representation import StateRepresentation, reconstruction_loss
 
 B, H, N, A, D, START = 3, 6, 2, 2, 4, 1
 
 
-def student_units(actions):
+def to_student(actions):
     return 3 * actions + 0.5
 
 
 @pytest.fixture
 def state_j():
-    config = RepresentationConfig(type="state", width=16, n_layers=1, n_heads=2, latent_dim=4)
     target = torch.randn(B, N, A)
     return StateDiscrepancy(
-        representation=StateRepresentation(D, A, N, config),
+        representation=StateRepresentation(D, A, N),
         observation=torch.randn(B, D),
-        target=student_units(target),
-        to_student=student_units,
+        target=to_student(target),
+        to_student=to_student,
         reference=ActionDiscrepancy(target, START),
     )
 
@@ -53,7 +51,7 @@ def test_gradient_works_under_no_grad_and_leaves_the_chunk_alone():
 def test_state_discrepancy_by_hand(state_j):
     """Up to its constant factor, J is the squared distance of the two predicted observations."""
     chunk = torch.randn(B, H, A)
-    executed = student_units(chunk[:, START : START + N])
+    executed = to_student(chunk[:, START : START + N])
     gap = state_j.representation(state_j.observation, executed) - state_j.representation(
         state_j.observation, state_j.target
     )
@@ -102,8 +100,7 @@ def test_reconstruction_loss_ignores_padded_futures():
 
 
 def test_representation_predicts_a_change_and_sees_every_step():
-    config = RepresentationConfig(type="state", width=16, n_layers=1, n_heads=2, latent_dim=4)
-    model = StateRepresentation(D, A, N, config)
+    model = StateRepresentation(D, A, N)
     observation, actions = torch.randn(B, D), torch.randn(B, N, A, requires_grad=True)
     predicted = model(observation, actions)
     torch.testing.assert_close(predicted - observation, model.decoder(model.encode(observation, actions)))

@@ -14,10 +14,10 @@ from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.policies.diffusion.modeling_diffusion import DiffusionModel
 from torch import nn
 
+from lerobot_agpd.guidance import guide as guidance
 from lerobot_agpd.guidance.discrepancy import ActionDiscrepancy
 from lerobot_agpd.guidance.guide import Guide, GuidedScheduler, Posterior, guided, posterior
 
-UNBOUNDED = 1e9  # a trust region that never acts
 SCHEDULES = [("DDPM", 100), ("DDPM", 10), ("DDIM", 10)]
 
 
@@ -71,12 +71,16 @@ def exact_model(
     return model
 
 
-def guide_toward(target, scale, at="x0", trust_region=UNBOUNDED, start=1, **options) -> Guide:
+@pytest.fixture(autouse=True)
+def unbounded(monkeypatch):
+    """A trust region that never acts, as the closed forms have none."""
+    monkeypatch.setattr(guidance, "TRUST_REGION", 1e9)
+
+
+def guide_toward(target, scale, at="x0", **options) -> Guide:
     """J = 1/2 (A[1] - target)^2: the chunk's entry 0 lies in the past and is not guided."""
     goal = torch.full((len(scale), 1, 1), target, dtype=torch.float64)
-    return Guide(
-        ActionDiscrepancy(goal, start), torch.as_tensor(scale), at=at, trust_region=trust_region, **options
-    )
+    return Guide(ActionDiscrepancy(goal, start=1), torch.as_tensor(scale), at=at, **options)
 
 
 def sample(model, guide, batch, seed=0, noise=None):
@@ -201,12 +205,13 @@ def test_numbers_of_the_documentation(at, mean, variance):
 
 @pytest.mark.parametrize("at", ["x0", "mu"])
 @pytest.mark.parametrize(("kind", "n_steps"), SCHEDULES)
-def test_scale_zero_is_bit_identical_to_unguided(kind, n_steps, at):
+def test_scale_zero_is_bit_identical_to_unguided(kind, n_steps, at, monkeypatch):
+    monkeypatch.setattr(guidance, "TRUST_REGION", 1.0)
     model = exact_model(kind, n_steps, 0.1, 0.4, torch.float32, clip=True)
     own = model.noise_scheduler
     unguided = sample(model, None, 6)
     assert torch.equal(sample(model, guide_toward(0.9, [0.0] * 6, at), 6), unguided)
-    mixed = sample(model, guide_toward(0.9, [0.0, 1.0, 0.0, 8.0, 0.0, 0.1], at, trust_region=1.0), 6)
+    mixed = sample(model, guide_toward(0.9, [0.0, 1.0, 0.0, 8.0, 0.0, 0.1], at), 6)
     assert torch.equal(mixed[[0, 2, 4]], unguided[[0, 2, 4]])
     assert (mixed[[1, 3, 5], 1] != unguided[[1, 3, 5], 1]).all()
     assert torch.equal(mixed[:, 0], unguided[:, 0])  # outside the executed window
@@ -229,20 +234,26 @@ spreads = st.floats(0.1, 1)
 scales = st.tuples(st.floats(0, 16), st.floats(0, 16)).map(sorted)
 
 
+def one_step(mu, x0, target, k, variance, trust, at):
+    """Shifts of the guided entry in one step, for two scales."""
+    step = Posterior(torch.full((2, 2, 1), mu), variance, torch.full((2, 2, 1), x0))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(guidance, "TRUST_REGION", trust)
+        return guide_toward(target, k, at).shift(step, 50)[:, 1, 0]
+
+
 @given(unit, unit, unit, scales, st.floats(0.01, 1), st.floats(0.1, 100))
 @settings(deadline=None)
-def test_property_one_step_at_mu_never_ends_farther_with_more_scale(mu, x0, target, k, variance, trust):
-    steps = Posterior(torch.full((2, 2, 1), mu), variance, torch.full((2, 2, 1), x0))
-    shift = guide_toward(target, k, "mu", trust).shift(steps, 50)[:, 1, 0]
+def test_one_step_at_mu_never_ends_farther_with_more_scale(mu, x0, target, k, variance, trust):
+    shift = one_step(mu, x0, target, k, variance, trust, "mu")
     less, more = (mu + shift - target).abs().tolist()
     assert more <= less + 1e-6 and less <= abs(mu - target) + 1e-6
 
 
 @given(unit, unit, unit, scales, st.floats(0.01, 1), st.floats(0.1, 100))
 @settings(deadline=None)
-def test_property_one_step_at_x0_moves_toward_the_student_and_not_past_it(mu, x0, target, k, variance, trust):
-    steps = Posterior(torch.full((2, 2, 1), mu), variance, torch.full((2, 2, 1), x0))
-    less, more = guide_toward(target, k, "x0", trust).shift(steps, 50)[:, 1, 0].tolist()
+def test_one_step_at_x0_moves_toward_the_student_and_not_past_it(mu, x0, target, k, variance, trust):
+    less, more = one_step(mu, x0, target, k, variance, trust, "x0").tolist()
     gap = target - x0
     assert less * gap >= 0 and more * gap >= 0
     assert abs(less) <= abs(more) + 1e-6 and abs(more) <= abs(gap) + 1e-6
@@ -250,7 +261,7 @@ def test_property_one_step_at_x0_moves_toward_the_student_and_not_past_it(mu, x0
 
 @given(unit, unit, spreads, scales)
 @settings(max_examples=8, deadline=None)
-def test_property_more_scale_never_moves_the_mean_farther_from_the_student(mean, target, std, k):
+def test_more_scale_never_moves_the_mean_farther_from_the_student(mean, target, std, k):
     """100 DDPM steps at x0, all noise at its mean (the chain is affine); strided chains can overshoot."""
     model = exact_model("DDPM", 100, mean, std)
     with pytest.MonkeyPatch.context() as patch:
@@ -263,7 +274,7 @@ def test_property_more_scale_never_moves_the_mean_farther_from_the_student(mean,
 
 @given(unit, unit, spreads, scales, st.sampled_from(["x0", "mu"]))
 @settings(max_examples=20, deadline=None)
-def test_property_more_scale_contracts_deterministic_chains(mean, target, std, k, at):
+def test_more_scale_contracts_deterministic_chains(mean, target, std, k, at):
     """DDIM maps the initial noise affinely: chains from 0 and from 1 end closer together under more scale."""
     model = exact_model("DDIM", 10, mean, std)
     start = torch.zeros(4, 2, 1, dtype=torch.float64)
@@ -278,33 +289,33 @@ def test_property_more_scale_contracts_deterministic_chains(mean, target, std, k
 
 @pytest.mark.parametrize("at", ["x0", "mu"])
 @pytest.mark.parametrize(("kind", "n_steps"), SCHEDULES)
-def test_trust_region_bounds_every_step(kind, n_steps, at):
+def test_trust_region_bounds_every_step(kind, n_steps, at, monkeypatch):
+    monkeypatch.setattr(guidance, "TRUST_REGION", 0.5)
     seen = []
-    guide = guide_toward(1e6, [1e6] * 5, at, trust_region=0.5, callback=seen.append)
+    guide = guide_toward(1e6, [1e6] * 5, at, callback=seen.append)
     x = sample(exact_model(kind, n_steps, 0.0, 0.5), guide, 5)
     assert x.abs().max() < 20
-    assert [step["timestep"] for step in seen] == list(range(100 - 100 // n_steps, -1, -(100 // n_steps)))
+    assert [step.timestep for step in seen] == list(range(100 - 100 // n_steps, -1, -(100 // n_steps)))
     for step in seen:
-        assert set(step) == {"timestep", "sigma", "j", "shift", "x0_hat"}
-        assert step["shift"].shape == step["x0_hat"].shape == (5, 2, 1) and step["j"].shape == (5,)
-        assert torch.equal(step["shift"][:, 0], torch.zeros(5, 1, dtype=torch.float64))
-        rms = step["shift"][:, 1].square().mean(dim=1).sqrt()  # over the guided entries
-        assert (rms <= 0.5 * step["sigma"] * (1 + 1e-6)).all()
-    assert seen[-1]["sigma"] == 0 and (seen[-1]["shift"] == 0).all()
-    assert len(guide.shift_in_sigmas) == len(guide.j) == n_steps - 1
+        assert step.shift.shape == step.x0_hat.shape == (5, 2, 1) and step.discrepancy.shape == (5,)
+        assert torch.equal(step.shift[:, 0], torch.zeros(5, 1, dtype=torch.float64))
+        rms = step.shift[:, 1].square().mean(dim=1).sqrt()  # over the guided entries
+        assert (rms <= 0.5 * step.sigma * (1 + 1e-6)).all()
+    assert seen[-1].sigma == 0 and (seen[-1].shift == 0).all()
+    assert len(guide.shift_in_sigmas) == n_steps - 1
     assert torch.stack(guide.shift_in_sigmas).allclose(torch.tensor(0.5, dtype=torch.float64))
 
 
-def test_shift_by_hand():
+def test_shift_by_hand(monkeypatch):
     """scale 2, sigma^2 = 1/4: half of the gap, on the executed steps only; capped rows keep their direction."""
-    x0 = torch.zeros(2, 4, 2)
+    seen, x0 = [], torch.zeros(2, 4, 2)
     target = torch.tensor([[[1.0, -2.0], [3.0, 0.0]]]).expand(2, 2, 2)
-    guide = Guide(ActionDiscrepancy(target, 1), torch.tensor([2.0, 0.0]), "x0", trust_region=100.0)
+    guide = Guide(ActionDiscrepancy(target, 1), torch.tensor([2.0, 0.0]), "x0", seen.append)
     shift = guide.shift(Posterior(torch.full((2, 4, 2), 9.0), 0.25, x0), 7)
     assert shift[0].tolist() == [[0, 0], [0.5, -1], [1.5, 0], [0, 0]]
     assert (shift[1] == 0).all()
-    assert guide.j[0].tolist() == [7.0, 7.0]  # (1 + 4 + 9) / 2
-    guide.trust_region = 0.1
+    assert seen[0].discrepancy.tolist() == [7.0, 7.0]  # (1 + 4 + 9) / 2
+    monkeypatch.setattr(guidance, "TRUST_REGION", 0.1)
     capped = guide.shift(Posterior(x0, 0.25, x0), 7)[0]
     rms = math.sqrt((0.25 + 1 + 2.25) / 3)  # over the nonzero entries
     torch.testing.assert_close(capped, shift[0] * 0.1 * 0.5 / rms)

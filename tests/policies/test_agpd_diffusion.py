@@ -4,6 +4,7 @@ import pytest
 import torch
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 
+from lerobot_agpd.config import AdversaryConfig
 from lerobot_agpd.policies.agpd_diffusion.configuration_agpd_diffusion import AGPDDiffusionConfig
 from lerobot_agpd.policies.agpd_diffusion.modeling_agpd_diffusion import AGPDDiffusionPolicy, clean_estimate
 
@@ -16,7 +17,7 @@ def policy(agpd_diffusion_config) -> AGPDDiffusionPolicy:
 
 
 @pytest.fixture
-def rows():
+def batch():
     return {
         "observation.state": torch.randn(B, 2, 2),
         "observation.environment_state": torch.randn(B, 2, 3),
@@ -46,7 +47,7 @@ def test_the_estimate_is_clipped_as_in_sampling():
     assert estimate.flatten().tolist() == pytest.approx([0.5, -0.2])
 
 
-def test_estimate_agrees_with_the_schedulers_own(policy, rows):
+def test_estimate_agrees_with_the_schedulers_own(policy, batch):
     """diffusers computes the same x0_hat inside `step`."""
     scheduler = policy.diffusion.noise_scheduler
     scheduler.set_timesteps(100)
@@ -57,12 +58,12 @@ def test_estimate_agrees_with_the_schedulers_own(policy, rows):
     torch.testing.assert_close(ours, theirs)
 
 
-def test_prior_chunk_starts_now_and_has_gradients(policy, rows):
+def test_prior_chunk_starts_now_and_has_gradients(policy, batch):
     policy.train()
-    chunk, condition = policy.prior_chunk(rows)
-    assert chunk.shape == (B, HORIZON - PRESENT, 2)
-    assert condition.shape == (B, policy.embedding_dim) == (B, 2 * (2 + 3))
-    chunk.sum().backward()
+    prior = policy.prior_chunk(batch)
+    assert prior.chunk.shape == (B, HORIZON - PRESENT, 2)
+    assert prior.embedding.shape == (B, policy.embedding_dim) == (B, 2 * (2 + 3))
+    prior.chunk.sum().backward()
     assert all(p.grad is not None for p in policy.diffusion.parameters())
 
 
@@ -74,18 +75,18 @@ def test_the_discriminator_sees_the_steps_from_now_on(policy):
     assert first.in_features == (HORIZON - PRESENT) * 2 + policy.embedding_dim
 
 
-def test_snapshot_acts_like_the_averaged_policy_and_stays_as_it_was(policy, rows):
+def test_snapshot_acts_like_the_averaged_policy_and_stays_as_it_was(policy, batch):
     policy.train()
     optimizer = torch.optim.SGD(policy.diffusion.parameters(), lr=0.5)
     for _ in range(3):
-        policy.forward(rows)[0].backward()
+        policy.forward(batch)[0].backward()
         optimizer.step()
         optimizer.zero_grad()
         policy.update()
     snapshot = policy.snapshot()
     assert policy.training and not snapshot.training
     assert not any(parameter.requires_grad for parameter in snapshot.parameters())
-    observation = {key: value for key, value in rows.items() if key.startswith("observation")}
+    observation = {key: value for key, value in batch.items() if key.startswith("observation")}
     noise = torch.randn(B, HORIZON, 2)
     policy.eval()
     expected = policy.predict_action_chunk(observation, noise=noise)
@@ -97,13 +98,13 @@ def test_snapshot_acts_like_the_averaged_policy_and_stays_as_it_was(policy, rows
     assert not torch.allclose(policy.predict_action_chunk(observation, noise=noise), expected)
 
 
-def test_checkpoint_round_trip(policy, rows, tmp_path):
+def test_checkpoint_round_trip(policy, batch, tmp_path):
     policy.eval()
     policy.save_pretrained(tmp_path)
     loaded = AGPDDiffusionPolicy.from_pretrained(tmp_path)
     assert isinstance(loaded.config, AGPDDiffusionConfig)
     noise = torch.randn(B, HORIZON, 2)
-    observation = {key: value for key, value in rows.items() if key.startswith("observation")}
+    observation = {key: value for key, value in batch.items() if key.startswith("observation")}
     assert torch.equal(
         loaded.predict_action_chunk(observation, noise=noise),
         policy.predict_action_chunk(observation, noise=noise),
@@ -111,8 +112,6 @@ def test_checkpoint_round_trip(policy, rows, tmp_path):
 
 
 def test_a_checkpoint_without_discriminator_can_be_distilled_on(agpd_diffusion_config, tmp_path):
-    from lerobot_agpd.distill.config import AdversaryConfig
-
     AGPDDiffusionPolicy(agpd_diffusion_config(adversary=AdversaryConfig(weight=0))).save_pretrained(tmp_path)
     loaded = AGPDDiffusionPolicy.from_pretrained(tmp_path, config=agpd_diffusion_config())
     assert loaded.discriminator is not None

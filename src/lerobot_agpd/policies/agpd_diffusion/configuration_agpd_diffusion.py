@@ -34,6 +34,11 @@ class AGPDDiffusionConfig(DiffusionTransformerConfig, StudentConfig):
         return None
 
     @property
+    def chunk_delta_indices(self) -> list[int]:
+        """Those of the diffusion policy (declared again: StudentConfig's are abstract)."""
+        return super(StudentConfig, self).chunk_delta_indices
+
+    @property
     def predicted_steps(self) -> int:
         """Of its chunk, LeRobot's diffusion policy returns the steps that it would execute."""
         return self.n_action_steps

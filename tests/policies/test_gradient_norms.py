@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from lerobot_agpd.distill.gradient_norms import GradientNorms
+from lerobot_agpd.policies.gradient_norms import GradientNorms
 
 
 @pytest.fixture

@@ -3,57 +3,66 @@
 from types import SimpleNamespace
 
 import torch
+from lerobot.configs import FeatureType, PolicyFeature
 
-from lerobot_agpd.collect.deciders.pair import Pair
-from lerobot_agpd.guidance.alignment import Alignment
 from lerobot_agpd.guidance.discrepancy import gradient
 from lerobot_agpd.guidance.teacher import Teacher
+from lerobot_agpd.guidance.teacher_student import TeacherStudent
 
 STATE = "observation.state"
 N_STEPS, N_CHUNK = 2, 3
-TEACHER_UNIT, STUDENT_UNIT = 2.0, 5.0  # raw actions per unit of either normalised space
+TEACHER_UNIT, STUDENT_UNIT = 2.0, 5.0  # raw actions per unit of either normalized space
 
 
 class NoisyTeacher(Teacher):
     """Every action of its chunk is the sum of the current state, plus `spread` units of noise.
 
     Guided, its chunk x in its own units becomes x - scale * grad J: for the action J and n steps, the point that
-    lies the share `scale` of the way to the student's.
+    lies the fraction `scale` of the way to the student's.
     """
 
     can_be_guided = True
+    n_chunk_steps, n_action_steps, start = N_CHUNK, N_STEPS, 1
 
-    def __init__(self, spread=0.5, action_dim=1, n_obs_steps=2):
-        self.policy = SimpleNamespace(config=SimpleNamespace(type="toy", n_obs_steps=n_obs_steps))
+    def __init__(self, spread=0.5, action_dim=1, n_obs_steps=2, state_dim=2):
+        self.policy = SimpleNamespace(
+            config=SimpleNamespace(
+                type="toy",
+                n_obs_steps=n_obs_steps,
+                input_features={STATE: PolicyFeature(FeatureType.STATE, (state_dim,))},
+                output_features={"action": PolicyFeature(FeatureType.ACTION, (action_dim,))},
+            )
+        )
         self.spread, self.action_dim = spread, action_dim
         self.calls = []
 
-    n_chunk_steps, n_action_steps, start = N_CHUNK, N_STEPS, 1
-
-    def to_units(self, actions_raw):
+    def normalize(self, actions_raw):
         return actions_raw / TEACHER_UNIT
 
-    def to_raw(self, actions):
+    def unnormalize(self, actions):
         return actions * TEACHER_UNIT
+
+    def mean_action(self, state):
+        """Its raw action (B, A) at states (B, D), without noise."""
+        return state.sum(dim=1, keepdim=True).expand(-1, self.action_dim)
 
     def sample(self, history, guide=None, generator=None):
         state = history[STATE]
         assert state.shape[1] >= self.n_obs_steps and len(history["task"]) == len(state)
         self.calls.append(len(state))
-        shape = (len(state), N_CHUNK + self.start, self.action_dim)
-        mean = self.to_units(state[:, -1].sum(dim=1))[:, None, None]
-        chunk = mean + self.spread * torch.randn(shape, generator=generator)
+        noise = torch.randn(len(state), N_CHUNK + self.start, self.action_dim, generator=generator)
+        chunk = self.normalize(self.mean_action(state[:, -1]))[:, None] + self.spread * noise
         if guide is not None:
             step = gradient(guide.discrepancy, chunk)[1]
             chunk = chunk - guide.scale[:, None, None] * step
             guide.shift_in_sigmas.append(guide.scale)
-        return self.to_raw(chunk[:, self.start :])
+        return self.unnormalize(chunk[:, self.start :])
 
     def _sample_chunk(self, batch, guide, generator):
         raise NotImplementedError
 
 
-class Replayer(NoisyTeacher):
+class Unguidable(NoisyTeacher):
     can_be_guided = False
 
 
@@ -63,20 +72,15 @@ def propose(history):
     return first[:, None, None].expand(-1, 4, 1)
 
 
-def alignment(teacher):
-    return Alignment(
-        start=teacher.start,
+def make_pair(teacher=None, student=propose, **options) -> TeacherStudent:
+    return TeacherStudent(
+        teacher=teacher or NoisyTeacher(),
+        student=student,
         n_steps=N_STEPS,
-        teacher_units=teacher.to_units,
-        teacher_raw=teacher.to_raw,
-        student_units=lambda actions: actions / STUDENT_UNIT,
-        student_raw=lambda actions: actions * STUDENT_UNIT,
+        normalize=lambda actions: actions / STUDENT_UNIT,
+        unnormalize=lambda actions: actions * STUDENT_UNIT,
+        **options,
     )
-
-
-def make_pair(teacher=None, student=propose, **options) -> Pair:
-    teacher = teacher or NoisyTeacher()
-    return Pair(teacher, student, alignment(teacher), **options)
 
 
 def noise(seed=3) -> torch.Generator:
@@ -85,11 +89,8 @@ def noise(seed=3) -> torch.Generator:
 
 def histories(n=5, length=2, seed=0):
     """States (n, length, 2), and a task."""
-    generator = torch.Generator().manual_seed(seed)
-    return {
-        STATE: torch.randn(n, length, 2, generator=generator),
-        "task": [f"task {row}" for row in range(n)],
-    }
+    state = torch.randn(n, length, 2, generator=noise(seed))
+    return {STATE: state, "task": [f"task {row}" for row in range(n)]}
 
 
 def student_actions(history) -> torch.Tensor:

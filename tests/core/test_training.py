@@ -1,0 +1,90 @@
+"""Stage 2 with a real diffusion teacher: what moves in training, when the adversary acts, what it compares."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from point_environment import teacher_weights
+
+from lerobot_agpd.config import AdversaryConfig, CollectConfig, ReplayConfig, RepresentationConfig
+
+
+@pytest.fixture
+def policy(build, agpd_config, save_teacher):
+    """An ACT student with everything that trains beside it, and no rounds."""
+    return build(
+        agpd_config(
+            teacher=save_teacher(),
+            collect=CollectConfig(every=0),
+            replay=ReplayConfig(relabel="all"),
+            adversary=AdversaryConfig(start=2, every=2),
+            representation=RepresentationConfig("state"),
+        )
+    )
+
+
+def train(policy, batch, n_steps):
+    """A few steps of LeRobot's loop; what they log."""
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=1e-3)
+    logs = []
+    for _ in range(n_steps):
+        loss, log = policy.forward(batch)
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        policy.update()
+        logs.append(log)
+    return logs
+
+
+def test_all_networks_train_but_the_teacher(policy, loop_batch):
+    taught, before = (
+        teacher_weights(policy.agpd.teacher),
+        {k: v.clone() for k, v in policy.state_dict().items()},
+    )
+    train(policy, loop_batch(policy.config, range(13)), 4)
+    assert torch.equal(teacher_weights(policy.agpd.teacher), taught)
+    assert not any(parameter.requires_grad for parameter in policy.agpd.teacher.policy.parameters())
+    moved = {
+        key.split(".")[0] for key, value in policy.state_dict().items() if not torch.equal(value, before[key])
+    }
+    assert moved == {"model", "discriminator", "representation"}
+
+
+def test_the_adversary_starts_and_then_acts_every_so_often(policy, loop_batch):
+    logs = train(policy, loop_batch(policy.config, range(13)), 7)
+    assert ["discriminator_loss" in log for log in logs] == [False, False, True, False, True, False, True]
+    assert all({"imitation_loss", "representation_loss", "collected_fraction"} <= set(log) for log in logs)
+    assert logs[-1]["grad_norm_student"] > 0 and all(isinstance(x, int | float) for x in logs[-1].values())
+
+
+def test_steps_that_only_one_of_both_predicts_are_not_compared(policy, loop_batch):
+    agpd, discriminator = policy.agpd, policy.discriminator
+    agpd.progress.step = 2
+    batch = agpd.train_batch(loop_batch(policy.config, [0, 6]))
+    whole, prior = agpd.adversary_batch(batch), policy.prior_chunk(batch)
+    assert whole.compared.all(), "the teacher's 15 steps cover the student's 8"
+    reference = replace(whole, compared=torch.arange(8).expand(2, -1) < 5)
+
+    def loss(reference, prior):
+        return agpd.losses(batch, reference, prior, discriminator).log["discriminator_loss"]
+
+    for step, is_compared in ((4, True), (5, False)):
+        disturbed = torch.zeros_like(whole.chunk)
+        disturbed[:, step] = 1.0
+        changed = (
+            loss(replace(reference, chunk=reference.chunk + disturbed), prior),
+            loss(reference, replace(prior, chunk=prior.chunk + disturbed)),
+        )
+        assert [value != loss(reference, prior) for value in changed] == [is_compared] * 2
+
+
+def test_held_out_losses_have_neither_adversary_nor_relabeled_chunks(policy, loop_batch):
+    batch = loop_batch(policy.config, [0, 6])
+    policy.eval()
+    with torch.no_grad():
+        loss, log = policy.forward(batch)
+    recorded = policy.agpd.eval_batch(batch)
+    assert "discriminator_loss" not in log and "action_is_pad" in recorded
+    trained_on = policy.train().agpd.train_batch(batch)
+    assert torch.isfinite(loss) and not torch.equal(trained_on["action"], recorded["action"])
