@@ -1,4 +1,4 @@
-"""Third-party environments, found by LeRobot's own two ways: `--env.discover_packages_path` and installation."""
+"""Types of third-party packages, found in LeRobot's own two ways: `discover_packages_path` and installation."""
 
 import json
 import shutil
@@ -21,7 +21,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import EnvConfig
 
-pytestmark = pytest.mark.slow
+from lerobot_agpd.loading import read_policy_config
 
 ROUND = [
     "--policy.collect.warmup=1",
@@ -30,6 +30,16 @@ ROUND = [
     "--policy.adversary.start=1",
     "--steps=3",
 ]
+
+
+def install(package: str, folder: Path) -> Path:
+    """A folder of installed packages with one of ours."""
+    site = folder / "site-packages"
+    shutil.copytree(PLUGINS / package, site / package)
+    metadata = site / f"{package}-0.1.0.dist-info" / "METADATA"
+    metadata.parent.mkdir()
+    metadata.write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 0.1.0\n")
+    return site
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +77,7 @@ def check(output: Path) -> None:
     assert journal["identity"]["environment"] == {"type": "point", "task": "Point-v0"}
 
 
+@pytest.mark.slow
 def test_a_package_named_on_the_command_line(
     demos: Path, teacher: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -85,16 +96,12 @@ def test_a_package_named_on_the_command_line(
     check(output)
 
 
-def test_an_installed_package(
+@pytest.mark.slow
+def test_an_installed_environment(
     demos: Path, teacher: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Named for the collection alone; the checkpoint then loads where the plugin is not known."""
-    site = tmp_path / "site-packages"
-    shutil.copytree(PLUGINS / "lerobot_env_point", site / "lerobot_env_point")
-    metadata = site / "lerobot_env_point-0.1.0.dist-info" / "METADATA"
-    metadata.parent.mkdir()
-    metadata.write_text("Metadata-Version: 2.1\nName: lerobot_env_point\nVersion: 0.1.0\n")
-    monkeypatch.syspath_prepend(site)
+    monkeypatch.syspath_prepend(install("lerobot_env_point", tmp_path))
     output = tmp_path / "run"
     run(
         "lerobot-train",
@@ -108,3 +115,12 @@ def test_an_installed_package(
     check(output)
     assert "point" not in EnvConfig.get_known_choices()
     assert PreTrainedConfig.from_pretrained(last_checkpoint(output)).type == "agpd"
+
+
+def test_an_installed_teacher_without_a_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """LeRobot's commands import installed plugins; a program that calls `train` need not have done so."""
+    monkeypatch.syspath_prepend(install("lerobot_policy_stub", tmp_path))
+    teacher = tmp_path / "teacher"
+    teacher.mkdir()
+    (teacher / "config.json").write_text(json.dumps({"type": "stub", "device": "cpu"}))
+    assert read_policy_config(teacher, "--policy.teacher.path").type == "stub"

@@ -98,9 +98,9 @@ def test_resuming_from_python(example: Path, tmp_path: Path, monkeypatch: pytest
         config = TrainPipelineConfig.from_pretrained(checkpoint)
         config.resume, config.output_dir = True, output
         config.steps += 2
-        config.policy.collect.every = 1
-        config.policy.collect.rounds = 3
-        config.policy.collect.episodes = 2
+        config.policy.collect = CollectConfig(
+            warmup=1, every=100, episodes=2
+        )  # the third round after step 201
         return config
 
     monkeypatch.setattr(sys, "argv", UNRELATED)
