@@ -16,6 +16,7 @@ from lerobot.policies import PreTrainedPolicy, get_policy_class, make_pre_post_p
 from lerobot.processor import NormalizerProcessorStep, PolicyAction, PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_PREFIX
 from lerobot.utils.feature_utils import dataset_to_policy_features
+from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_agpd.config import CollectConfig, FlagError, StudentConfig, TeacherConfig, require
 from lerobot_agpd.guidance.adapters import as_teacher
@@ -43,6 +44,7 @@ def read_policy_config(path: str | Path, flag: str) -> PreTrainedConfig:
         FileNotFoundError: if there is no policy at the path.
         FlagError: if its configuration holds fields that this version does not have.
     """
+    register_third_party_plugins()  # the type may be a plugin's, and only LeRobot's commands have done it by now
     try:
         config = PreTrainedConfig.from_pretrained(path)
     except DraccusException as error:

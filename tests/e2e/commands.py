@@ -1,6 +1,7 @@
 """Commands and flags of the end-to-end tests: tiny networks, real environments."""
 
 import importlib.metadata
+import json
 import multiprocessing
 import os
 import subprocess
@@ -14,6 +15,8 @@ import torch
 from lerobot_agpd.plugin import FORKSERVER_PRELOAD
 
 BIN = Path(sys.executable).parent
+EXAMPLES = Path(__file__).parents[2] / "examples"
+PLUGINS = Path(__file__).parents[1] / "plugins"
 
 PICK = ["--env.type=gymnasium_robotics", "--env.task=FetchPickAndPlace-v4"]
 QUIET = ["--num_workers=0", "--env_eval_freq=0", "--log_freq=10"]
@@ -57,6 +60,29 @@ def environment(**extra: str) -> dict[str, str]:
 
 def dataset_flags(root: Path) -> list[str]:
     return ["--dataset.repo_id=local/test", f"--dataset.root={root}"]
+
+
+# ---- what a run leaves behind ----
+
+
+def last_checkpoint(output: Path) -> Path:
+    return output / "checkpoints" / "last" / "pretrained_model"
+
+
+def round_folder(output: Path, number: int) -> Path:
+    return output / "agpd" / f"round-{number:05d}"
+
+
+def reports(output: Path) -> list[dict]:
+    """Reports of the finished rounds of a run."""
+    paths = sorted((output / "agpd").glob("round-*/report.json"))
+    return [json.loads(path.read_text()) for path in paths]
+
+
+def records(output: Path, number: int, rank: int = 0) -> list[dict]:
+    """Complete lines of a process's index of a round."""
+    path = round_folder(output, number) / f"rank-{rank}.jsonl"
+    return [json.loads(line) for line in path.read_text().split("\n")[:-1]] if path.exists() else []
 
 
 # ---- commands in processes of their own, forked from one that has imported LeRobot ----

@@ -4,10 +4,11 @@ import os
 from pathlib import Path
 
 import pytest
+from commands import EXAMPLES
 
 os.environ.setdefault("MUJOCO_GL", "egl")  # before anything renders
 
-QUICKSTART = Path(__file__).parents[2] / "examples" / "quickstart"
+QUICKSTART = EXAMPLES / "quickstart"
 
 
 @pytest.fixture

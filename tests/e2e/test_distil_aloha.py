@@ -1,11 +1,10 @@
-"""The same command line distils from ALOHA's cameras: a smoke run with LeRobot's own diffusion policy as teacher."""
+"""The same command line distills from ALOHA's cameras: a smoke run with LeRobot's own diffusion policy as teacher."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import QUIET, TINY_STUDENT, dataset_flags, run
+from commands import QUIET, TINY_STUDENT, dataset_flags, last_checkpoint, records, reports, run
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import make_env
 from lerobot.envs.configs import AlohaEnv
@@ -76,7 +75,7 @@ def test_distillation_from_cameras(aloha_demos: Path, tmp_path: Path) -> None:
         *network,
         "--batch_size=2",
         *dataset_flags(aloha_demos),
-        f"--policy.teacher.path={teacher / 'checkpoints' / 'last' / 'pretrained_model'}",
+        f"--policy.teacher.path={last_checkpoint(teacher)}",
         "--env.type=aloha",
         "--env.task=AlohaTransferCube-v0",
         f"--env.episode_length={N_STEPS}",
@@ -88,7 +87,6 @@ def test_distillation_from_cameras(aloha_demos: Path, tmp_path: Path) -> None:
         "--steps=3",
         f"--output_dir={output}",
     )
-    report = json.loads((output / "agpd" / "round-000" / "round.json").read_text())
-    assert report["generated"] == 2
-    assert [record["length"] for record in report["episodes"]] == [N_STEPS, N_STEPS]
+    assert [report["total"]["generated"] for report in reports(output)] == [2]
+    assert [record["length"] for record in records(output, 0)] == [N_STEPS, N_STEPS]
     assert (output / "checkpoints" / "000003" / "pretrained_model" / "model.safetensors").is_file()

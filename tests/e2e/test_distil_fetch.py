@@ -7,7 +7,18 @@ from pathlib import Path
 
 import pytest
 import torch
-from commands import PICK, TINY_STUDENT, dataset_flags, run, run_afresh, start
+from commands import (
+    PICK,
+    TINY_STUDENT,
+    dataset_flags,
+    last_checkpoint,
+    records,
+    reports,
+    round_folder,
+    run,
+    run_afresh,
+    start,
+)
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors import safe_open
 from safetensors.torch import load_file
@@ -25,13 +36,6 @@ COLLECT = [
 ]
 
 
-def records(path: Path) -> list[dict]:
-    """Complete lines of a spool."""
-    if not path.exists():
-        return []
-    return [json.loads(line) for line in path.read_text().split("\n")[:-1]]
-
-
 def test_killed_run_is_resumed_evaluated_and_exported(
     fetch_demos: Path, fetch_teacher: Path, tmp_path: Path
 ) -> None:
@@ -46,45 +50,40 @@ def test_killed_run_is_resumed_evaluated_and_exported(
         *dataset_flags(fetch_demos),
         f"--policy.teacher.path={teacher}",
         "--policy.representation.type=state",
-        "--policy.representation.width=16",
         f"--output_dir={first}",
         log=tmp_path / "first.log",
     )
-    spool = first / "agpd" / "round-001.partial" / "spool-0.jsonl"
     deadline = time.monotonic() + 600
-    while len(records(spool)) < 3:
+    while len(records(first, 1)) < 3:
         assert process.is_alive(), (tmp_path / "first.log").read_text()[-5000:]
         assert time.monotonic() < deadline
         time.sleep(0.02)
     process.kill()  # SIGKILL
     process.join()
-    spooled = records(spool)
-    assert 3 <= len(spooled) < 12, "killed in the middle of a round"
+    before = records(first, 1)
+    assert 3 <= len(before) < 12, "killed in the middle of a round"
 
     moved = tmp_path / "moved"
     first.rename(moved)
-    config = moved / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
+    config = last_checkpoint(moved) / "train_config.json"
     run("lerobot-train", f"--config_path={config}", "--resume=true", f"--output_dir={moved}")
 
-    manifest = json.loads((moved / "agpd" / "manifest.json").read_text())["rounds"]
-    assert [entry["round"] for entry in manifest] == [0, 1], (
-        "one round at 20, one at 40, none at the last step"
-    )
-    report = json.loads((moved / "agpd" / "round-001" / "round.json").read_text())
-    assert report["generated"] == 12
-    by_number = {record["number"]: record for record in report["episodes"]}
-    assert [by_number[record["number"]] for record in spooled] == spooled, (
-        "spooled episodes are not collected again"
-    )
-    assert sum(entry["kept"] for entry in manifest) > 0
+    rounds = reports(moved)
+    assert [(report["round"], report["step"]) for report in rounds] == [(0, 20), (1, 40)], "none at step 60"
+    after = records(moved, 1)
+    assert after[: len(before)] == before, "no episode is lost"
+    assert sorted(record["number"] for record in after) == list(range(12)), "none is collected twice"
+    assert rounds[1]["total"]["generated"] == 12
 
+    kept = sum(record["kept"] for number in range(2) for record in records(moved, number))
+    assert kept == sum(report["total"]["kept"] for report in rounds) > 0
     merged = LeRobotDataset("local/merged", root=moved / "agpd" / "merged")
-    assert merged.num_episodes == sum(entry["kept"] for entry in manifest)
-    assert {"agpd.round", "agpd.scale", "agpd.strategy"} <= set(merged.features)
+    assert merged.num_episodes == kept
+    assert {"agpd.round", "agpd.strength", "agpd.strategy"} <= set(merged.features)
 
     checkpoint = moved / "checkpoints" / "000060" / "pretrained_model"
     state = json.loads((checkpoint / "agpd_state.json").read_text())
-    assert (state["updates"], state["rounds"]) == (60, 2)
+    assert (state["step"], state["rounds"]) == (60, 2)
     with safe_open(checkpoint / "model.safetensors", "pt") as weights:
         assert {key.split(".")[0] for key in weights.keys()} == {"model", "discriminator", "representation"}  # noqa: SIM118
     assert json.loads((checkpoint / "config.json").read_text())["collect"]["env"] is None
@@ -140,8 +139,7 @@ def test_resuming_changes_nothing(fetch_demos: Path, fetch_teacher: Path, tmp_pa
     )
     straight = load_file(output / "checkpoints" / "000030" / "pretrained_model" / "model.safetensors")
     shutil.rmtree(output / "checkpoints" / "000030")
-    shutil.rmtree(output / "agpd" / "round-001")  # collected at step 25, after the checkpoint
-    (output / "agpd" / "manifest.json").unlink()
+    shutil.rmtree(round_folder(output, 1))  # collected at step 25, after the checkpoint
     config = output / "checkpoints" / "000020" / "pretrained_model" / "train_config.json"
     run("lerobot-train", f"--config_path={config}", "--resume=true")
     resumed = load_file(output / "checkpoints" / "000030" / "pretrained_model" / "model.safetensors")
@@ -169,32 +167,39 @@ def test_two_processes_share_a_round(fetch_demos: Path, fetch_teacher: Path, tmp
         "--steps=10",
         f"--output_dir={output}",
     )
-    report = json.loads((output / "agpd" / "round-000" / "round.json").read_text())
-    assert report["generated"] == 7
-    assert len({record["seed"] for record in report["episodes"]}) == 7, "each process has its own seeds"
-    assert [record["number"] for record in report["episodes"]] == [0, 1, 2, 3, 0, 1, 2]
-    kept = [
-        LeRobotDataset("x", root=path).num_episodes for path in (output / "agpd" / "round-000").glob("rank-*")
-    ]
-    assert sum(kept) == report["kept"] > 0
+    (report,) = reports(output)
+    episodes = [records(output, 0, rank) for rank in range(2)]
+    numbers = [sorted(record["number"] for record in part) for part in episodes]
+    assert numbers == [[0, 1, 2, 3], [0, 1, 2]]
+    assert len({record["seed"] for part in episodes for record in part}) == 7, (
+        "each process has its own seeds"
+    )
+    kept = sum(record["kept"] for part in episodes for record in part)
+    assert (report["total"]["generated"], report["total"]["kept"]) == (7, kept)
+    assert LeRobotDataset("x", root=output / "agpd" / "merged").num_episodes == kept > 0
+    assert last_checkpoint(output).is_dir()
 
 
 def test_a_run_without_any_success_goes_on_cloning(
     fetch_demos: Path, fetch_teacher: Path, tmp_path: Path
 ) -> None:
-    output = run(
+    output = tmp_path / "run"
+    printed = run(
         "lerobot-train",
         *TINY_STUDENT,
         *PICK,
-        *COLLECT,
         *dataset_flags(fetch_demos),
         f"--policy.teacher.path={fetch_teacher}",
+        "--policy.collect.warmup=2",
+        "--policy.collect.every=2",
         "--policy.collect.min_reward=1",  # Fetch pays at most 0
-        "--policy.collect.episodes=3",
-        f"--output_dir={tmp_path / 'run'}",
+        "--policy.collect.episodes=2",
+        "--policy.adversary.start=1",
+        "--steps=6",
+        f"--output_dir={output}",
     )
-    assert "round 1 kept no episode" in output
-    assert "--policy.collect.min_reward" in output
-    manifest = json.loads((tmp_path / "run" / "agpd" / "manifest.json").read_text())["rounds"]
-    assert [(entry["generated"], entry["kept"], entry["datasets"]) for entry in manifest] == [(3, 0, [])] * 2
-    assert (tmp_path / "run" / "checkpoints" / "000060").is_dir()
+    assert "--policy.collect.min_reward" in printed
+    totals = [report["total"] for report in reports(output)]
+    assert [(total["generated"], total["kept"]) for total in totals] == [(2, 0)] * 2
+    assert not (output / "agpd" / "merged").exists()
+    assert (output / "checkpoints" / "000006").is_dir()

@@ -5,7 +5,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from commands import QUIET, TINY_STUDENT, dataset_flags, run_here
+from commands import QUIET, TINY_STUDENT, dataset_flags, last_checkpoint, reports, run_here
 from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 from pusht import record
 from safetensors.torch import load_file
@@ -45,8 +45,6 @@ ROUNDS = [
     "--policy.collect.every=2",
     "--policy.collect.episodes=2",
     "--policy.collect.min_reward=1e-6",
-    "--policy.collect.diagnostics.observations=2",
-    "--policy.collect.diagnostics.samples=2",
     "--policy.adversary.start=0",
 ]
 
@@ -54,10 +52,6 @@ ROUNDS = [
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory) -> Path:
     return record(tmp_path_factory.mktemp("pusht") / "demos", pixels=False)
-
-
-def last_checkpoint(output: Path) -> Path:
-    return output / "checkpoints" / "last" / "pretrained_model"
 
 
 def resume(output: Path, step: str) -> None:
@@ -86,8 +80,8 @@ def test_teacher(kind: str, demos: Path, tmp_path: Path) -> None:
         "--steps=4",
         f"--output_dir={student}",
     )
-    report = json.loads((student / "agpd" / "round-000" / "round.json").read_text())
-    assert report["generated"] == 2 and report["mean_shift_in_sigmas"] > 0
+    report = reports(student)[0]
+    assert report["total"]["generated"] == 2 and report["mean_guidance_shift"] > 0
     evaluated = tmp_path / "eval"
     run_here(
         "lerobot-eval",
@@ -118,11 +112,11 @@ def test_self_distillation(denoiser: str, demos: Path, tmp_path: Path) -> None:
         "--save_freq=3",
         f"--output_dir={output}",
     )
-    reports = [json.loads(path.read_text()) for path in sorted((output / "agpd").glob("round-*/round.json"))]
-    assert [report["scale"] > 0 for report in reports] == [False, True, True]
-    assert [report["guided"]["generated"] for report in reports] == [0, 2, 2]
-    assert reports[0]["next_scale"] == 0.5, "an unguided round does not move the scale"
-    assert reports[1]["mean_j_guided"] > 0
+    rounds = reports(output)
+    assert [report["strength"] > 0 for report in rounds] == [False, True, True]
+    assert [report["strategy"]["generated"] for report in rounds] == [0, 2, 2]
+    assert rounds[0]["next_scale"] == 0.5, "an unguided round does not move the scale"
+    assert rounds[1]["mean_discrepancy"] > 0
 
     checkpoint = output / "checkpoints" / "000006" / "pretrained_model"
     assert (checkpoint / "previous_self.safetensors").is_file()
@@ -158,5 +152,5 @@ def test_diffusion_student_of_a_teacher(demos: Path, tmp_path: Path, capfd) -> N
         f"--output_dir={student}",
     )
     assert "discriminator_accuracy" in capfd.readouterr().err
-    report = json.loads((student / "agpd" / "round-000" / "round.json").read_text())
-    assert report["scale"] == 0.5 and report["guided"]["generated"] == 2
+    report = reports(student)[0]
+    assert report["strength"] == 0.5 and report["strategy"]["generated"] == 2

@@ -6,15 +6,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from commands import TINY_STUDENT, TINY_TEACHER, dataset_flags, run, run_afresh
+from commands import (
+    TINY_STUDENT,
+    TINY_TEACHER,
+    dataset_flags,
+    last_checkpoint,
+    records,
+    reports,
+    run,
+    run_afresh,
+)
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from pusht import N_STEPS, record
 
-from lerobot_agpd.collect.report import summarise
-from lerobot_agpd.collect.success import SuccessFilter
-from lerobot_agpd.replay.episode import Episode, Ticket
-from lerobot_agpd.replay.store import ReplayStore
-from lerobot_agpd.replay.writer import EpisodeWriter
+from lerobot_agpd.config import CollectConfig
+from lerobot_agpd.replay.episode import Episode, EpisodeSpec
+from lerobot_agpd.replay.journal import EpisodeJournal
+from lerobot_agpd.rollout.report import RoundReport
+from lerobot_agpd.rollout.success import classify
 
 pytestmark = pytest.mark.slow
 
@@ -22,9 +31,9 @@ PIXELS = ["--env.type=pusht", "--env.obs_type=pixels_agent_pos", f"--env.episode
 
 
 def test_cloning_and_asynchronous_evaluation(tmp_path: Path) -> None:
-    """As in a shell: LeRobot's forkserver workers know gym_pusht only because the plugin preloads it."""
+    """The evaluation as in a shell: LeRobot's forkserver workers know gym_pusht only because the plugin preloads it."""
     demos = record(tmp_path / "demos", pixels=False)
-    run_afresh(
+    run(
         "lerobot-train",
         *TINY_STUDENT,
         *dataset_flags(demos),
@@ -37,7 +46,7 @@ def test_cloning_and_asynchronous_evaluation(tmp_path: Path) -> None:
     )
     run_afresh(
         "lerobot-eval",
-        f"--policy.path={tmp_path / 'run' / 'checkpoints' / 'last' / 'pretrained_model'}",
+        f"--policy.path={last_checkpoint(tmp_path / 'run')}",
         "--policy.device=cpu",
         "--env.type=pusht",
         "--env.obs_type=environment_state_agent_pos",
@@ -50,13 +59,13 @@ def test_cloning_and_asynchronous_evaluation(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "eval" / "eval_info.json").read_text())["overall"]["n_episodes"] == 2
 
 
-def finished_round(root: Path, demos: Path) -> None:
-    """A round of one kept episode, as collection leaves it."""
+def write_round(root: Path, demos: Path, identity: dict) -> None:
+    """A finished round of one kept episode, the first demonstration, as collection leaves it."""
     dataset = LeRobotDataset("local/test", root=demos, episodes=[0])
     frames = [dataset[step] for step in range(N_STEPS)]
     images = [(frame["observation.image"] * 255).round().permute(1, 2, 0).numpy() for frame in frames]
     episode = Episode(
-        ticket=Ticket(number=0, seed=1_000_000, scale=0.5),
+        spec=EpisodeSpec(number=0, seed=1_000_000, strength=0.5),
         task="push",
         observations={
             "observation.state": np.stack([frame["observation.state"].numpy() for frame in frames]),
@@ -65,18 +74,16 @@ def finished_round(root: Path, demos: Path) -> None:
         actions=np.stack([frame["action"].numpy() for frame in frames]),
         rewards=np.linspace(0, 1, N_STEPS, dtype=np.float32),
         successes=None,
-        j=0.1,
-        shift=0.1,
     )
-    store = ReplayStore(root)
-    store.spool(0, 0).add(episode, SuccessFilter(min_reward=0.9, min_length=2).judge(episode))
-    store.write_share(0, 0, lambda path, kept: EpisodeWriter(dataset.meta).write(path, kept, 0, "guided"))
-    report = {"round": 0, "scale": 0.5, "next_scale": 0.5, "seconds": {}, **summarise(store.records(0, 1))}
-    store.finish(0, 1, report)
+    journal = EpisodeJournal(root)
+    journal.begin(dataset.meta, identity)
+    journal.append(0, 0, episode, classify(episode, CollectConfig(min_reward=0.9)))
+    report = RoundReport.of(journal.records(0), round=0, strength=0.5, next_scale=0.5, step=0)
+    journal.finish(0, report.to_json())
 
 
 def test_distillation_from_pixels(tmp_path: Path) -> None:
-    """Images come from the loader for demonstrations and from the rounds' datasets for collected frames."""
+    """Images come from the loader for demonstrations and from the journal for collected frames."""
     demos = record(tmp_path / "demos", pixels=True)
     network = ["--policy.pretrained_backbone_weights=null", "--dataset.use_imagenet_stats=false"]
     teacher = tmp_path / "teacher"
@@ -93,22 +100,24 @@ def test_distillation_from_pixels(tmp_path: Path) -> None:
         "--steps=5",
         f"--output_dir={teacher}",
     )
-    rounds = tmp_path / "rounds"
-    finished_round(rounds, demos)
+    rounds = tmp_path / "agpd"
+    environment = {"type": "pusht", "task": "PushT-v0"}
+    origin = {"environment": environment, "teacher": str(last_checkpoint(teacher)), "seed": 1000}
+    write_round(rounds, demos, {"strategy": "guided", **origin})
     printed = run(
         "lerobot-train",
         *TINY_STUDENT,
         *network,
         *PIXELS,
         *dataset_flags(demos),
-        f"--policy.teacher.path={teacher / 'checkpoints' / 'last' / 'pretrained_model'}",
+        f"--policy.teacher.path={last_checkpoint(teacher)}",
         f"--policy.replay.root={rounds}",
         "--policy.collect.warmup=1",
         "--policy.collect.every=2",
         "--policy.collect.rounds=2",
         "--policy.collect.episodes=3",
         "--policy.collect.min_reward=0.9",
-        "--policy.replay.collected_share=0.5",
+        "--policy.replay.collected_fraction=0.5",
         "--dataset.image_transforms.enable=true",
         "--policy.adversary.start=2",
         "--batch_size=8",
@@ -116,10 +125,11 @@ def test_distillation_from_pixels(tmp_path: Path) -> None:
         "--steps=5",
         f"--output_dir={tmp_path / 'run'}",
     )
-    assert "replay holds 1 finished rounds" in printed
-    assert "collected_share:0.500" in printed
-    report = json.loads((rounds / "round-001" / "round.json").read_text())
-    assert [record["length"] for record in report["episodes"]] == [N_STEPS] * 3
-    collected = LeRobotDataset("x", root=rounds / "round-000" / "rank-0")
+    assert "collected_fraction:0.500" in printed
+    (_, report) = reports(tmp_path)
+    assert report["total"]["generated"] == 3
+    assert [record["length"] for record in records(tmp_path, 1)] == [N_STEPS] * 3
+    merged = LeRobotDataset("x", root=rounds / "merged")
     original = LeRobotDataset("local/test", root=demos)
-    assert torch.equal(collected[7]["observation.image"], original[7]["observation.image"])
+    assert merged.num_episodes == 1 + report["total"]["kept"]
+    assert torch.equal(merged[7]["observation.image"], original[7]["observation.image"])
