@@ -4,7 +4,7 @@
 UV := $(shell uv --version >/dev/null 2>&1 && echo uv || echo .uv/bin/uv)
 RUN := $(UV) run --frozen --all-extras
 
-.PHONY: help setup quickstart test test-fast lint
+.PHONY: help setup quickstart test test-fast lint .mypy
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -25,5 +25,8 @@ test: setup  ## all tests, fast ones first
 test-fast: setup  ## tests without the end-to-end runs
 	@OMP_NUM_THREADS=1 $(RUN) pytest -m "not slow" -n auto --dist loadfile
 
-lint: setup  ## ruff and mypy
+lint: setup .mypy  ## ruff and mypy
 	@$(RUN) ruff check . && $(RUN) ruff format --check . && $(RUN) mypy
+
+.mypy: setup  # LeRobot's sources, which mypy does not follow in site-packages: they have no py.typed marker
+	@mkdir -p .mypy && ln -sfn $$($(RUN) python -c 'import importlib.util as u; print(u.find_spec("lerobot").submodule_search_locations[0])') .mypy/lerobot

@@ -41,7 +41,9 @@ class SelfTeacher:
         """
         self.previous = self._newest
         self._newest = self.student.snapshot()
-        processors = make_pre_post_processors(self.student.config, dataset_stats=dict(stats))
+        processors = make_pre_post_processors(
+            self.student.config, dataset_stats={key: dict(entry) for key, entry in stats.items()}
+        )
         return as_teacher(self._newest, *processors)
 
     def save(self, folder: Path) -> None:

@@ -54,6 +54,7 @@ class FrameTable:
             )
         columns = {key: torch.as_tensor(frames[key]).float().reshape(len(index), -1) for key in keys}
         episodes = dataset.meta.episodes
+        assert episodes is not None  # metadata of a dataset with frames
         starts, ends = (torch.as_tensor(episodes[f"dataset_{side}_index"]) for side in ("from", "to"))
         return cls(columns, (ends - starts).tolist())
 

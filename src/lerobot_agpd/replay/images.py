@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -40,7 +41,7 @@ class RecordedFrames:
 
     def _read(self, index: int, keys: Sequence[str]) -> dict[str, Tensor]:
         if index < self.n_demonstration_frames:
-            item = self.dataset[index]
+            item: Any = self.dataset[index]
             return {key: item[key] for key in keys}
         episode, step = self._locate(index)
         frames = {key: torch.from_numpy(episode.frame(key, step)) for key in keys}
@@ -60,5 +61,7 @@ class RecordedFrames:
 
 def _tasks(dataset: LeRobotDataset) -> list[str]:
     """The task of every frame."""
-    names = {int(index): str(name) for name, index in dataset.meta.tasks["task_index"].items()}
+    tasks = dataset.meta.tasks
+    assert tasks is not None  # metadata of a dataset with frames
+    names = {int(index): str(name) for name, index in tasks["task_index"].items()}
     return [names[int(index)] for index in dataset.hf_dataset.with_format("numpy")["task_index"][:]]

@@ -82,11 +82,16 @@ class EpisodeJournal:
             ValueError: if the folder holds episodes of another run.
         """
         if not self.exists:
-            features = demonstrations.features
-            content = {"fps": demonstrations.fps, "robot_type": demonstrations.robot_type}
-            content |= {"task": str(demonstrations.tasks.index[0]), "features": features}
+            tasks = demonstrations.tasks
+            content = {
+                "fps": demonstrations.fps,
+                "robot_type": demonstrations.robot_type,
+                "task": "" if tasks is None else str(tasks.index[0]),
+                "features": demonstrations.features,
+                "identity": dict(identity),
+            }
             self.root.mkdir(parents=True, exist_ok=True)
-            write_json(self.root / HEADER, {**content, "identity": dict(identity)}, indent=2)
+            write_json(self.root / HEADER, content, indent=2)
         if not resume:
             self._check_identity(json.loads(json.dumps(dict(identity), default=str)))
 

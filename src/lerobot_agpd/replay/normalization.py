@@ -50,7 +50,7 @@ class Normalizer:
         self.stats = stats
         arguments: dict[str, Any] = {
             "features": {**(config.input_features or {}), **(config.output_features or {})},
-            "norm_map": config.normalization_mapping,
+            "norm_map": getattr(config, "normalization_mapping"),  # noqa: B009  # every policy has one, not the base class
             "stats": {key: dict(entry) for key, entry in stats.items()},
         }
         self._normalize = NormalizerProcessorStep(**arguments)

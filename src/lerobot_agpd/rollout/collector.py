@@ -157,5 +157,5 @@ class Collector:
         with stopwatch.measure("diagnostics"), seeded_context(seed):
             actions = action_diagnostics(strategy, history, strength, seed) if history else None
             kept = (episode.observations for episode in self.journal.kept(round_number))
-            states = state_diagnostics(kept, self.demonstrations.stats, seed)
+            states = state_diagnostics(kept, self.demonstrations.stats or {}, seed)
         return RoundDiagnostics(actions, states, stopwatch.seconds["diagnostics"])

@@ -120,10 +120,11 @@ class RoundReport:
     def from_json(cls, entry: Mapping[str, Any]) -> RoundReport:
         """The inverse of `to_json`."""
         tallies = ("total", "strategy", "teacher_only", "retried", "student_alone")
-        diagnostics = entry["diagnostics"]
-        nested = {name: Tally(**entry[name]) for name in tallies}
-        nested["diagnostics"] = diagnostics and RoundDiagnostics(**diagnostics)
-        return cls(**{**entry, **nested})
+        measured = entry["diagnostics"]
+        diagnostics = RoundDiagnostics(**measured) if measured else None
+        return cls(
+            **{**entry, **{name: Tally(**entry[name]) for name in tallies}, "diagnostics": diagnostics}
+        )
 
     @property
     def scalars(self) -> dict[str, float]:

@@ -181,12 +181,18 @@ def step_limit(envs: gym.vector.VectorEnv) -> int:
         ValueError: if it does not say.
     """
     try:
-        return int(envs.get_attr("_max_episode_steps")[0])
+        return int(_attribute(envs, "_max_episode_steps"))
     except (AttributeError, TypeError) as error:
         raise ValueError(
             "--policy.collect.strategy=rollin gives the student a fraction of the longest episode, and the environment "
             "does not say after how many steps it ends one (no _max_episode_steps); use another strategy"
         ) from error
+
+
+def _attribute(envs: gym.vector.VectorEnv, name: str) -> Any:
+    """An attribute of the first sub-environment; synchronous and asynchronous ones have it, their base class not."""
+    get_attr: Callable[[str], tuple[Any, ...]] = envs.get_attr  # type: ignore[attr-defined]
+    return get_attr(name)[0]
 
 
 def _row(observations: dict[str, Tensor], row: int) -> dict[str, Tensor]:
@@ -209,7 +215,7 @@ def _success(info: Mapping[str, Any], slot: int, done: bool) -> bool | None:
 def _task_description(envs: gym.vector.VectorEnv) -> str:
     for name in ("task_description", "task"):
         try:
-            return str(envs.get_attr(name)[0])
+            return str(_attribute(envs, name))
         except AttributeError:
             continue
     return ""

@@ -43,4 +43,4 @@ def make_expert(env: EnvConfig) -> Expert:
             f"--env.task={env.task} has no scripted expert. Tasks of {env.type} with one: "
             f"{', '.join(tasks)}.{instead}"
         )
-    return tasks[env.task]
+    return tasks[str(env.task)]

@@ -39,14 +39,14 @@ class AGPDConfig(ACTConfig, StudentConfig):
             f"(--policy.chunk_size={self.chunk_size})",
         )
 
-    def get_scheduler_preset(self) -> DiffuserSchedulerConfig | None:
+    def get_scheduler_preset(self) -> DiffuserSchedulerConfig | None:  # type: ignore[override]
         """The named schedule over the run's steps, None for a constant learning rate."""
         if self.scheduler_name is None:
             return None
         return DiffuserSchedulerConfig(name=self.scheduler_name, num_warmup_steps=self.scheduler_warmup_steps)
 
     @property
-    def action_delta_indices(self) -> None:
+    def action_delta_indices(self) -> None:  # type: ignore[override]
         """None: the loader delivers single frames, chunks are cut from memory."""
         return None
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.utils.constants import OBS_IMAGES
 from torch import Tensor
@@ -15,11 +16,11 @@ from lerobot_agpd.run import RunInfo
 from lerobot_agpd.student import PriorChunk
 
 
-class AGPDPolicy(DistilledPolicy, ACTPolicy):
+class AGPDPolicy(DistilledPolicy, ACTPolicy):  # type: ignore[misc]
     """ACT (arXiv:2304.13705) distilled from a diffusion policy; in eval mode it is LeRobot's ACT."""
 
     config: AGPDConfig
-    config_class = AGPDConfig
+    config_class: type[ACTConfig] = AGPDConfig
     name = "agpd"
 
     def __init__(
@@ -45,7 +46,7 @@ class AGPDPolicy(DistilledPolicy, ACTPolicy):
         In training mode ACT decodes from a latent that has seen the recorded actions. Here the actions are left
         out and the network runs in eval mode (no dropout either), with gradients.
         """
-        inputs: dict[str, Any] = {key: batch[key] for key in self.config.input_features}
+        inputs: dict[str, Any] = {key: batch[key] for key in self.config.input_features or {}}
         if self.config.image_features:
             inputs[OBS_IMAGES] = [batch[key] for key in self.config.image_features]
         tokens: list[Tensor] = []  # (n_tokens, B, dim_model)

@@ -24,19 +24,14 @@ class AGPDDiffusionConfig(DiffusionTransformerConfig, StudentConfig):
         """Images are allowed: T reads those from disk."""
 
     @property
-    def observation_delta_indices(self) -> None:
+    def observation_delta_indices(self) -> None:  # type: ignore[override]
         """None: the loader delivers single frames, histories are cut from T."""
         return None
 
     @property
-    def action_delta_indices(self) -> None:
+    def action_delta_indices(self) -> None:  # type: ignore[override]
         """None: the loader delivers single frames, chunks are cut from T."""
         return None
-
-    @property
-    def chunk_delta_indices(self) -> list[int]:
-        """Those of the diffusion policy (declared again: StudentConfig's are abstract)."""
-        return super(StudentConfig, self).chunk_delta_indices
 
     @property
     def predicted_steps(self) -> int:

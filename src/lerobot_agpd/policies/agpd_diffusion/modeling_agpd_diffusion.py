@@ -20,7 +20,7 @@ from lerobot_agpd.run import RunInfo
 from lerobot_agpd.student import PriorChunk
 
 
-class AGPDDiffusionPolicy(DistilledPolicy, DiffusionTransformerPolicy):
+class AGPDDiffusionPolicy(DistilledPolicy, DiffusionTransformerPolicy):  # type: ignore[misc]
     """A diffusion policy distilled from another one, or from itself (Table 1).
 
     The averaged weights act: they are evaluated, propose chunks while collecting, and teach in self-distillation.
