@@ -7,6 +7,7 @@ gradient-reversal layer (arXiv:1409.7495), so one loss and one optimizer serve, 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,6 +63,21 @@ class Discriminator(nn.Module):
     def forward(self, chunk: Tensor, embedding: Tensor) -> Tensor:
         """Logit that the student made the chunk, (B,), for chunks (B, S, A) and embeddings (B, E)."""
         return self.layers(torch.cat([chunk.flatten(1), embedding], dim=1))[:, 0]
+
+
+@dataclass(frozen=True)
+class AdversaryBatch:
+    """What the discriminator compares the student with at a training step.
+
+    Attributes:
+        batch: features of the frames concerned.
+        chunk: (B, S, A) the teacher's chunks there, in the student's normalized space.
+        compared: (B, S) bool, True on the steps that teacher and student both have.
+    """
+
+    batch: Mapping[str, Any]
+    chunk: Tensor
+    compared: Tensor
 
 
 @dataclass(frozen=True)

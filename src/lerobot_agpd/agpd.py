@@ -26,6 +26,7 @@ LeRobot's own training loop drives it, through policies/distilled.py; build.py p
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -35,7 +36,7 @@ from lerobot.utils.constants import ACTION
 from lerobot.utils.random_utils import seeded_context
 from torch import Tensor
 
-from lerobot_agpd.adversary import Discriminator, adversary_terms
+from lerobot_agpd.adversary import AdversaryBatch, Discriminator, adversary_terms
 from lerobot_agpd.build import Parts
 from lerobot_agpd.config import CollectConfig, GuidanceConfig, StudentConfig
 from lerobot_agpd.guidance.guide import Guide
@@ -143,21 +144,6 @@ def rounds_due(step: int, config: CollectConfig) -> int:
 
 
 @dataclass(frozen=True)
-class AdversaryBatch:
-    """What the discriminator compares the student with at a training step.
-
-    Attributes:
-        batch: the frames concerned.
-        chunk: (B, S, A) the teacher's chunks there, in the student's normalized space.
-        compared: (B, S) bool, True on the steps that teacher and student both have.
-    """
-
-    batch: Batch
-    chunk: Tensor
-    compared: Tensor
-
-
-@dataclass(frozen=True)
 class Losses:
     """What AGPD adds to L_IL: a loss to be minimized, and its terms for the log."""
 
@@ -195,9 +181,7 @@ class AGPD:
         before, self.progress.step = self.progress.step, self.progress.step + self.run.steps_per_update
         self.progress.seen_episodes = sorted(self.replay.seen_episodes)
         due = rounds_due(self.progress.step, self.config.collect)
-        is_last = (
-            self.run.steps is not None and self.progress.step + self.run.steps_per_update > self.run.steps
-        )
+        is_last = self.progress.step + self.run.steps_per_update > (self.run.steps or math.inf)
         # None after the last step, because no student would learn from it; none twice, if a killed run has it already.
         if due > rounds_due(before, self.config.collect) and due > len(self.reports) and not is_last:
             self.collect_round()
@@ -288,11 +272,6 @@ class AGPD:
         if self.teacher_chunks is None or self.config.replay.relabel == "none":
             return batch
         return self.teacher_chunks.relabel(batch, self.config)
-
-    def eval_batch(self, batch: Batch) -> Batch:
-        """A batch of demonstrations alone, for a held-out loss."""
-        self.replay.demonstrations.observe(batch)
-        return self.replay.eval_batch(batch)
 
     def adversary_batch(self, batch: Batch) -> AdversaryBatch | None:
         """The teacher's chunks for the frames of a batch; None where the adversary does not act at this step.

@@ -153,7 +153,7 @@ def test_the_alternation(start, toy_teacher):
     frame_index = batches[0][FRAME_INDEX]
     assert (frame_index < n_demonstrated).any() and (frame_index >= n_demonstrated).any()
     assert torch.equal(frame_index, batches[1][FRAME_INDEX]), "a step's frames follow from its number"
-    eval_index = agpd.eval_batch(run.batch())[FRAME_INDEX]
+    eval_index = agpd.replay.eval_batch(run.batch())[FRAME_INDEX]
     assert (eval_index < n_demonstrated).all(), "a held-out loss is that of demonstrations"
 
     run.train(until=STEPS)

@@ -84,7 +84,7 @@ def test_held_out_losses_have_neither_adversary_nor_relabeled_chunks(policy, loo
     policy.eval()
     with torch.no_grad():
         loss, log = policy.forward(batch)
-    recorded = policy.agpd.eval_batch(batch)
+    recorded = policy.agpd.replay.eval_batch(batch)
     assert "discriminator_loss" not in log and "action_is_pad" in recorded
     trained_on = policy.train().agpd.train_batch(batch)
     assert torch.isfinite(loss) and not torch.equal(trained_on["action"], recorded["action"])

@@ -90,7 +90,7 @@ class DistilledPolicy(Student):
             return super().forward(batch, **kwargs)
         agpd = self.agpd
         if not self.training:
-            return super().forward(agpd.eval_batch(batch), **kwargs)
+            return super().forward(agpd.replay.eval_batch(batch), **kwargs)
         batch = agpd.train_batch(batch)
         loss, log = super().forward(batch, **kwargs)
         reference = agpd.adversary_batch(batch)

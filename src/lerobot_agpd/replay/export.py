@@ -14,6 +14,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import DONE, OBS_PREFIX
 from lerobot.utils.utils import is_valid_numpy_dtype_string
 
+from lerobot_agpd.dataset_writer import DatasetWriter
 from lerobot_agpd.replay.episode import Array
 from lerobot_agpd.replay.journal import EpisodeJournal
 from lerobot_agpd.replay.stored import StoredEpisode
@@ -53,32 +54,28 @@ def merge(root: Path, repo_id: str | None = None) -> LeRobotDataset | None:
             dataset written by this function.
     """
     journal = EpisodeJournal(root)
-    merged, partial, replaced = (root / f"{MERGED}{suffix}" for suffix in ("", ".partial", ".replaced"))
+    merged, fresh, replaced = (root / f"{MERGED}{suffix}" for suffix in ("", ".new", ".replaced"))
     _check_replaceable(merged)
     episodes = iter(journal.stored())
     first = next(episodes, None)
     if first is None:
         return None
-    for leftover in (partial, replaced):
-        shutil.rmtree(leftover, ignore_errors=True)
-    repo_id = repo_id or f"agpd/{root.resolve().parent.name}"
+    shutil.rmtree(fresh, ignore_errors=True)
     features = _merged_features(journal, first)
-    dataset = LeRobotDataset.create(
-        repo_id=repo_id,
+    writer = DatasetWriter(
+        root=fresh,
+        repo_id=repo_id or f"agpd/{root.resolve().parent.name}",
         fps=journal.header["fps"],
         features=features,
-        root=partial,
         robot_type=journal.header["robot_type"],
         use_videos=any(feature["dtype"] == "video" for feature in features.values()),
     )
-    for round_number, episode in (first, *episodes):
-        _add(dataset, features, episode, _columns(journal, round_number, episode))
-    dataset.finalize()
+    writer.write(_frames(journal, features, *stored) for stored in (first, *episodes))
     if merged.exists():
         merged.rename(replaced)
-    partial.rename(merged)
+    fresh.rename(merged)
     shutil.rmtree(replaced, ignore_errors=True)
-    return LeRobotDataset(repo_id, root=merged)
+    return LeRobotDataset(writer.repo_id, root=merged)
 
 
 def _check_replaceable(merged: Path) -> None:
@@ -151,22 +148,15 @@ def _merged_features(journal: EpisodeJournal, first: tuple[int, StoredEpisode]) 
     return chosen | {key: dict(feature) for key, feature in ORIGIN_FEATURES.items()}
 
 
-def _add(
-    dataset: LeRobotDataset,
-    features: Mapping[str, Feature],
-    episode: StoredEpisode,
-    columns: Mapping[str, Any],
-) -> None:
+def _frames(
+    journal: EpisodeJournal, features: Mapping[str, Feature], round_number: int, episode: StoredEpisode
+) -> Iterator[dict[str, Any]]:
+    """The frames of a merged episode, with its task."""
+    columns = _columns(journal, round_number, episode)
     check_observation(features, {key: columns[key][0] for key in features if key.startswith(OBS_PREFIX)})
     typed = {key: _cast(columns[key], feature) for key, feature in features.items()}
-    for frame in _frames(typed, len(episode)):
-        dataset.add_frame({**frame, "task": episode.task})
-    dataset.save_episode()
-
-
-def _frames(columns: Mapping[str, Any], n_steps: int) -> Iterator[dict[str, Any]]:
-    for step in range(n_steps):
-        yield {key: column[step] for key, column in columns.items()}
+    for step in range(len(episode)):
+        yield {**{key: column[step] for key, column in typed.items()}, "task": episode.task}
 
 
 def _shapes(feature: Feature) -> list[tuple[int, ...]]:

@@ -161,6 +161,7 @@ class Replay:
 
     def eval_batch(self, batch: Batch) -> Batch:
         """The loader's frames with their chunks, for a held-out loss."""
+        self.demonstrations.observe(batch)
         return self._gather(batch, batch["index"])
 
     def _gather(self, batch: Batch, frame_index: Tensor, augment: bool = False) -> Batch:
