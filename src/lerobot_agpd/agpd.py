@@ -50,6 +50,7 @@ from lerobot_agpd.rollout.seeds import STUDENT_NOISE_STREAM
 from lerobot_agpd.rollout.strategies import (
     ChunkBatch,
     MixingStrategy,
+    NearestStrategy,
     RollInStrategy,
     Strategy,
     TeacherStrategy,
@@ -106,6 +107,8 @@ def make_strategy(config: StudentConfig, pair: TeacherStudent, generator: torch.
         return TeacherStrategy(pair, generator)
     if config.collect.strategy == "mixing":
         return MixingStrategy(pair, generator, config.collect.mixing)
+    if config.collect.strategy == "nearest":
+        return NearestStrategy(pair, generator)
     guided = GuidedStrategy(pair, generator, config.guidance)
     return RollInStrategy(guided) if config.collect.strategy == "rollin" else guided
 
@@ -232,11 +235,11 @@ class AGPD:
         return make_strategy(self.config, pair, self.collector.noise(number))
 
     def _strength(self) -> float:
-        """Guidance scale or mixing weight of a round's episodes."""
+        """Guidance scale, mixing weight or number of samples of a round's episodes; 0: the teacher alone."""
+        collect = self.config.collect
+        strengths = {"mixing": collect.mixing.weight, "nearest": collect.nearest_samples, "teacher": 0.0}
         has_target = self.self_teacher is None or self.self_teacher.previous is not None
-        if self.config.collect.strategy == "mixing":
-            return self.config.collect.mixing.weight if has_target else 0.0
-        return self.scale if self.config.collect.guides and has_target else 0.0
+        return float(strengths.get(collect.strategy, self.scale)) if has_target else 0.0
 
     def _report(self, number: int, strength: float, strategy: Strategy) -> RoundReport:
         assert self.collector is not None and self.journal is not None

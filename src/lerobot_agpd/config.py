@@ -26,7 +26,7 @@ COLLECTION_SEEDS = (1_000_000, 2**31 - 1)
 NoiseScheduler = Literal["DDPM", "DDIM"]
 GuidancePoint = Literal["x0", "mu"]
 RepresentationType = Literal["action", "state"]
-StrategyName = Literal["guided", "teacher", "mixing", "rollin"]
+StrategyName = Literal["guided", "nearest", "teacher", "mixing", "rollin"]
 MixingForm = Literal["interpolate", "switch"]
 Relabel = Literal["none", "demonstrations", "all"]
 
@@ -106,8 +106,11 @@ class CollectConfig:
 
     # Environment to collect in; default: the run's --env.*.
     env: EnvConfig | None = None
-    # guided: AGPD; teacher: the teacher alone (PD); mixing: DAgger; rollin: the student begins, the teacher finishes.
+    # guided: AGPD; nearest: of several samples of the teacher the one nearest to the student's chunk; teacher: the
+    # teacher alone (PD); mixing: DAgger; rollin: the student begins, the teacher finishes.
     strategy: StrategyName = "guided"
+    # strategy=nearest: samples of the teacher per decision, of which one is executed; at their cost.
+    nearest_samples: int = 8
     # Settings of strategy=mixing.
     mixing: MixingConfig = field(default_factory=MixingConfig)
     # Training steps on the demonstrations before the first round.
@@ -151,6 +154,10 @@ class CollectConfig:
         for name in ("teacher_only_fraction", "retry_fraction"):
             value = getattr(self, name)
             require(0 <= value <= 1, f"--policy.collect.{name} must be in [0, 1], got {value}")
+        require(
+            self.nearest_samples >= 2,
+            f"--policy.collect.nearest_samples must be at least 2, got {self.nearest_samples}",
+        )
         require(
             self.n_action_steps is None or self.n_action_steps >= 1,
             f"--policy.collect.n_action_steps must be at least 1, got {self.n_action_steps}",

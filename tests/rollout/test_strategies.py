@@ -18,7 +18,12 @@ from toy_policies import (
 
 from lerobot_agpd.agpd import GuidedStrategy, make_strategy
 from lerobot_agpd.config import CollectConfig, FlagError, GuidanceConfig, MixingConfig
-from lerobot_agpd.rollout.strategies import MixingStrategy, RollInStrategy, TeacherStrategy
+from lerobot_agpd.rollout.strategies import (
+    MixingStrategy,
+    NearestStrategy,
+    RollInStrategy,
+    TeacherStrategy,
+)
 
 STRENGTHS = st.lists(st.floats(0, 1), min_size=5, max_size=5).map(torch.tensor)
 SOME = torch.tensor([True, False, True, False, False])
@@ -213,3 +218,45 @@ def test_a_teacher_that_cannot_be_guided_is_refused(at):
     with pytest.raises(FlagError, match="--policy.collect.strategy.*'toy'"):
         Unguidable().require_guidance(at)
     NoisyTeacher().require_guidance(at)
+
+
+# ---- nearest ----
+
+
+def nearest(pair=None, seed=3) -> NearestStrategy:
+    return NearestStrategy(pair or make_pair(Unguidable()), noise(seed))
+
+
+def test_nearest_executes_a_sample_that_is_never_farther_than_the_teachers_own():
+    history = histories()
+    chunks = nearest().act(history, torch.full((5,), 32.0))
+    own = discrepancy_of(alone(history), history)
+    assert (chunks.discrepancy <= own).all() and (chunks.discrepancy < own).any()
+    torch.testing.assert_close(chunks.discrepancy, discrepancy_of(chunks.actions, history))
+
+
+def test_nearest_leaves_rows_without_strength_to_the_teacher_bit_for_bit():
+    history = histories()
+    chunks = nearest().act(history, torch.where(SOME, 16.0, 0.0))
+    assert torch.equal(chunks.actions[~SOME], alone(history)[~SOME])
+    assert not torch.equal(chunks.actions[SOME], alone(history)[SOME])
+    assert torch.equal(nearest().act(history, torch.zeros(5)).actions, alone(history))
+
+
+def test_nearest_samples_the_teacher_as_often_as_its_strength_says():
+    teacher = Unguidable()
+    nearest(make_pair(teacher)).act(histories(), torch.where(SOME, 4.0, 0.0))
+    assert teacher.calls == [5, 2 * 3], "once for every row, three times more where it chooses"
+
+
+def test_nearest_chooses_by_the_learned_discrepancy():
+    """A J that is smallest for the largest first action: the choice is the largest of the samples."""
+    start = NoisyTeacher.start
+    pair = make_pair(Unguidable(), make_discrepancy=lambda *_: lambda chunk: -chunk[:, start, 0])
+    history = histories()
+    chosen = nearest(pair).act(history, torch.full((5,), 16.0)).actions[:, 0, 0]
+    teacher, generator = Unguidable(), noise()
+    first = teacher.sample(history, generator=generator)[:, 0, 0]
+    repeated = {STATE: history[STATE].repeat_interleave(15, 0), "task": ["a task"] * 75}
+    others = teacher.sample(repeated, generator=generator)[:, 0, 0].unflatten(0, (5, 15))
+    torch.testing.assert_close(chosen, torch.maximum(first, others.max(dim=1).values))

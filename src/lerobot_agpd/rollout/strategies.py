@@ -4,6 +4,7 @@ teacher  the teacher alone                                  TeacherStrategy     
 mixing   teacher and student share the actions              MixingStrategy           DAgger, Eq. 6-7
 rollin   the student begins, another strategy finishes      RollInStrategy           not in the paper
 guided   the teacher, guided toward the student             agpd.GuidedStrategy      AGPD, Eq. 19-20
+nearest  the teacher's sample nearest to the student        NearestStrategy          not in the paper
 """
 
 from __future__ import annotations
@@ -124,6 +125,44 @@ class MixingStrategy(Strategy):
         return (drawn < probability.to(device)).to(probability)
 
 
+class NearestStrategy(Strategy):
+    """Sample several chunks of the teacher and execute the one with the smallest J.
+
+    Not in the paper: guidance without gradients, for any stochastic teacher, also one that cannot be guided. It costs
+    as many samples as `strength` says; with many independent choices per chunk that number must grow, which guidance's
+    cost does not.
+    """
+
+    def act(self, history: History, strength: Tensor, student_acts: Tensor | None = None) -> ChunkBatch:
+        """The nearest of `strength` samples; rows at 0 are the teacher's own bit for bit, as is every first sample."""
+        chunk_hat = self.pair.propose(history)  # (B, S, A), student-normalized
+        actions = self.pair.teacher_actions(history, self.generator)  # (B, n, A) raw
+        chosen, n_more = strength > 0, int(strength.max()) - 1
+        if n_more > 0:
+            asked = select(history, chosen)
+            target = chunk_hat[chosen.to(chunk_hat.device)]
+            more = self.pair.teacher_actions(repeat(asked, n_more), self.generator)
+            candidates = torch.cat([actions[chosen][:, None], more.unflatten(0, (-1, n_more))], dim=1)
+            nearest = self._discrepancies(asked, target, candidates).argmin(dim=1)  # of (B', N, n, A)
+            actions[chosen] = candidates[torch.arange(len(nearest)), nearest.to(candidates.device)]
+        target = self.pair.student_in_teacher_space(chunk_hat)
+        return ChunkBatch(
+            actions,
+            discrepancy=self.pair.executed_discrepancy(actions, target),
+            guidance_shift=unknown(actions),
+        )
+
+    def _discrepancies(self, history: History, chunk_hat: Tensor, candidates: Tensor) -> Tensor:
+        """The guiding J, (B, N), of raw executed steps (B, N, n, A)."""
+        n_samples = candidates.shape[1]
+        history, chunk_hat = repeat(history, n_samples), chunk_hat.repeat_interleave(n_samples, dim=0)
+        action_j = self.pair.action_discrepancy(chunk_hat)
+        discrepancy = self.pair.guiding_discrepancy(history, chunk_hat, action_j)
+        executed = self.pair.teacher.normalize(candidates.flatten(0, 1))  # (B * N, n, A)
+        past = executed.new_zeros(len(executed), self.pair.teacher.start, executed.shape[2])
+        return discrepancy(torch.cat([past, executed], dim=1)).unflatten(0, (-1, n_samples))
+
+
 class RollInStrategy(Strategy):
     """The student acts first, then another strategy finishes the episode.
 
@@ -166,6 +205,16 @@ def select(history: History, chosen: Tensor) -> dict[str, Any]:
     """The rows of a history that a mask (B,) chooses."""
     return {
         key: value[chosen.to(value.device)] if isinstance(value, Tensor) else _chosen(value, chosen)
+        for key, value in history.items()
+    }
+
+
+def repeat(history: History, times: int) -> dict[str, Any]:
+    """Every row of a history several times in a row."""
+    return {
+        key: value.repeat_interleave(times, dim=0)
+        if isinstance(value, Tensor)
+        else [entry for entry in value for _ in range(times)]
         for key, value in history.items()
     }
 
