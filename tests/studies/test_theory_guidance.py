@@ -40,10 +40,10 @@ def policies(min_student: float = 0.0):
 # Moments: Eq. 6-9, 16
 
 
-def sampled_moments(actions: np.ndarray, towards: np.ndarray) -> ActionLaw:
-    """Moments of actions (N, 3) whose means lie on the line through 0 (teacher) and `towards` (student)."""
-    gap = np.linalg.norm(towards)
-    along = actions @ towards / gap
+def sampled_moments(actions: np.ndarray, toward: np.ndarray) -> ActionLaw:
+    """Moments of actions (N, 3) whose means lie on the line through 0 (teacher) and `toward` (student)."""
+    gap = np.linalg.norm(toward)
+    along = actions @ toward / gap
     total = actions.var(axis=0).sum()
     return ActionLaw(along.mean() / gap, along.var(), (total - along.var()) / 2, 3)
 
@@ -51,16 +51,16 @@ def sampled_moments(actions: np.ndarray, towards: np.ndarray) -> ActionLaw:
 @pytest.mark.parametrize("mixing", list(Mixing))
 def test_mixing_has_the_moments_of_samples(mixing):
     rng = np.random.default_rng(3)
-    towards = np.array([1.0, -2.0, 0.5])
-    p = Policies(0.5, 1.5, float(np.linalg.norm(towards)), 3)
+    toward = np.array([1.0, -2.0, 0.5])
+    p = Policies(0.5, 1.5, float(np.linalg.norm(toward)), 3)
     n, lam = 400_000, 0.3
     teacher = math.sqrt(0.5) * rng.normal(size=(n, 3))
-    student = towards + math.sqrt(1.5) * rng.normal(size=(n, 3))
+    student = toward + math.sqrt(1.5) * rng.normal(size=(n, 3))
     if mixing is INTERPOLATE:
         actions = lam * student + (1 - lam) * teacher
     else:
         actions = np.where(rng.random((n, 1)) < lam, student, teacher)
-    found, law = sampled_moments(actions, towards), mix(p, lam, mixing)
+    found, law = sampled_moments(actions, toward), mix(p, lam, mixing)
     for field in ("fraction", "var_along", "var_across", "variance"):
         assert getattr(law, field) == pytest.approx(getattr(found, field), rel=0.01), field
 
