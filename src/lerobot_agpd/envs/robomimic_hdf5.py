@@ -22,13 +22,13 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
-from lerobot_agpd.envs.base import require_packages
+from lerobot_agpd.envs.packages import require_packages
 
 Array = np.ndarray
 
@@ -42,7 +42,7 @@ NO_OBSERVATIONS = (
 )
 
 
-class RobomimicFile:
+class RobomimicFile(AbstractContextManager["RobomimicFile"]):
     """A robomimic dataset, open for reading.
 
     Attributes:
@@ -69,7 +69,7 @@ class RobomimicFile:
         try:
             self._file = h5py.File(path, "r")
         except OSError as error:
-            kind = "truncated or damaged" if _has_signature(path) else "not an HDF5 file"
+            kind = "truncated or damaged" if h5py.is_hdf5(path) else "not an HDF5 file"
             raise ValueError(f"{path} is {kind}: {error}") from error
         self.env_args = self._env_args()
         self.data = self._file["data"]
@@ -84,12 +84,7 @@ class RobomimicFile:
         masks = self._file.get("mask", {})
         self.masks = {key: [name.decode() for name in masks[key][()]] for key in sorted(masks)}
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._file.close()
 
     def _env_args(self) -> dict[str, Any]:
@@ -238,11 +233,6 @@ class RobomimicFile:
         """SHA-256 of a demonstration's MuJoCo model; None if it has none."""
         model = self.data[demo].attrs.get("model_file")
         return None if model is None else hashlib.sha256(model.encode()).hexdigest()
-
-
-def _has_signature(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(8) == b"\x89HDF\r\n\x1a\n"
 
 
 def sha256(path: Path) -> str:

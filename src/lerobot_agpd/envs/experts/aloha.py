@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from lerobot_agpd.envs.base import AGENT_POS
 from lerobot_agpd.envs.experts.aloha_kinematics import HandPoses, arm_kinematics, rotation_vectors
 from lerobot_agpd.envs.experts.aloha_servos import position_servos
-from lerobot_agpd.envs.experts.base import Array, Expert, Observation, ramp, state_vectors
+from lerobot_agpd.envs.experts.base import Array, Expert, Observation, descend, ramp, state_vectors
 
 # Places among the 14 numbers of `agent_pos` and of an action.
 ARM_JOINTS = np.array([range(6), range(7, 13)])  # (2, 6)
@@ -155,11 +155,9 @@ def intend_transfer(observation: Observation) -> Array:
 def _right_displacement(scene: TransferScene) -> Array:
     """Come down onto the cube in a funnel, take it to the meeting point; draw back once the left has it."""
     to_cube = scene.cube - scene.right
-    sideways = float(np.linalg.norm(to_cube[:2]))
     fingers_shut = (1.0 - scene.right_surrounds) * ramp(scene.right_opening, zero_at=0.95, one_at=0.8)
-    clearance = GRASP_CLEARANCE * max(ramp(sideways, zero_at=0.008, one_at=0.05), fingers_shut)
-    descend = to_cube + np.array([0.0, 0.0, clearance])
-    pick_up = (1.0 - scene.right_holds) * descend + scene.right_holds * (MEETING_POINT - scene.cube)
+    approach = descend(to_cube, GRASP_CLEARANCE, fingers_shut)
+    pick_up = (1.0 - scene.right_holds) * approach + scene.right_holds * (MEETING_POINT - scene.cube)
     draw_back = to_cube - RETREAT * RIGHT_POINTS
     return (1.0 - scene.left_holds) * pick_up + scene.left_holds * draw_back
 
