@@ -4,6 +4,7 @@ Beside the dataset, `meta/robomimic.json` says where every episode comes from, a
 recordings in full precision with simulator states and models, for replaying them.
 """
 
+import hashlib
 import json
 import logging
 import sys
@@ -116,6 +117,7 @@ def provenance(file: RobomimicFile, demos: Sequence[str], digest: str) -> dict[s
         digest: SHA-256 of the file.
     """
     operators = [*file.operators, None]  # -1 is none of them
+    models = {demo: file.model_xml(demo) for demo in demos}
     return {
         "source": {"file": file.path.name, "sha256": digest, "bytes": file.path.stat().st_size},
         "env_args": file.env_args,
@@ -128,9 +130,9 @@ def provenance(file: RobomimicFile, demos: Sequence[str], digest: str) -> dict[s
                 "demo": demo,
                 "length": file.length(demo),
                 "operator": operators[file.operator_of(demo)],
-                "model_sha256": file.model_sha256(demo),
+                "model_sha256": model and hashlib.sha256(model.encode()).hexdigest(),
             }
-            for demo in demos
+            for demo, model in models.items()
         ],
     }
 

@@ -225,14 +225,19 @@ class RobomimicFile(AbstractContextManager["RobomimicFile"]):
                 )
         return values
 
+    def model_xml(self, demo: str) -> str | None:
+        """MuJoCo model of a demonstration; None if the file has none.
+
+        `RobosuiteEnv.reset_to(file.read(demo, "states")[0], file.model_xml(demo))` puts the simulator where the actions
+        began. Without the model a replay of lift ends up millimeters off: robosuite draws the cube's size when it builds
+        a model.
+        """
+        model: str | None = self.data[demo].attrs.get("model_file")
+        return model
+
     def is_replayable(self, demo: str) -> bool:
         """Whether a demonstration has simulator states and the model that they belong to."""
-        return "states" in self.data[demo] and "model_file" in self.data[demo].attrs
-
-    def model_sha256(self, demo: str) -> str | None:
-        """SHA-256 of a demonstration's MuJoCo model; None if it has none."""
-        model = self.data[demo].attrs.get("model_file")
-        return None if model is None else hashlib.sha256(model.encode()).hexdigest()
+        return "states" in self.data[demo] and self.model_xml(demo) is not None
 
 
 def sha256(path: Path) -> str:

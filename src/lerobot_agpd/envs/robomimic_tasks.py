@@ -67,55 +67,34 @@ def key_dim(key: str) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class RobomimicTask(TaskSpec):
-    """Properties of one task.
+    """Properties of one task; the defaults are those of one arm.
 
     Attributes:
         robosuite_name: robosuite's name of the environment.
-        n_robots: number of Pandas.
-        agent_keys: observables that make up `agent_pos`, in order: those of `robot0`, then those of `robot1`.
         object_keys: robosuite 1.5's observables that make up `environment_state`, in order; robomimic's files
             `*_v15.hdf5` hold their concatenation as `obs/object`.
         object_keys_v141: the same in the order of robosuite 1.4.1, which is that of the files `*_v141.hdf5`.
         cameras: those of robomimic's image datasets.
         more_cameras: further ones that the model has.
+        episode_length: robomimic's horizon of a rollout for its proficient-human data, steps.
+        n_robots: number of Pandas.
     """
 
     robosuite_name: str
-    n_robots: int
-    agent_keys: tuple[str, ...]
     object_keys: tuple[str, ...]
     object_keys_v141: tuple[str, ...]
     cameras: tuple[str, ...]
     more_cameras: tuple[str, ...]
+    fps: int = FPS
+    episode_length: int = 400
+    n_robots: int = 1
+    action_dim: int = ARM_ACTION_DIM
+    agent_pos_dim: int = 9
 
-
-def _task(
-    robosuite_name: str,
-    description: str,
-    object_keys: tuple[str, ...],
-    object_keys_v141: tuple[str, ...],
-    cameras: tuple[str, ...],
-    more_cameras: tuple[str, ...],
-    episode_length: int = 400,
-    n_robots: int = 1,
-) -> RobomimicTask:
-    """Build a task; `episode_length` is robomimic's horizon of a rollout for its proficient-human data."""
-    agent_keys = tuple(f"robot{robot}_{key}" for robot in range(n_robots) for key in ARM_KEYS)
-    return RobomimicTask(
-        description=description,
-        fps=FPS,
-        episode_length=episode_length,
-        action_dim=ARM_ACTION_DIM * n_robots,
-        agent_pos_dim=sum(map(key_dim, agent_keys)),
-        environment_state_dim=sum(map(key_dim, object_keys)),
-        robosuite_name=robosuite_name,
-        n_robots=n_robots,
-        agent_keys=agent_keys,
-        object_keys=object_keys,
-        object_keys_v141=object_keys_v141,
-        cameras=cameras,
-        more_cameras=more_cameras,
-    )
+    @property
+    def agent_keys(self) -> tuple[str, ...]:
+        """Observables that make up `agent_pos`, in order: those of `robot0`, then those of `robot1`."""
+        return tuple(f"robot{robot}_{key}" for robot in range(self.n_robots) for key in ARM_KEYS)
 
 
 def _poses_v141(*names: str) -> tuple[str, ...]:
@@ -130,7 +109,6 @@ def _poses(*names: str) -> tuple[str, ...]:
     return tuple(f"{name}_{suffix}" for name in names for suffix in suffixes)
 
 
-_CUBE = ("cube_pos", "cube_quat", "gripper_to_cube_pos")
 _HANGING_FLAGS = ("frame_is_assembled", "tool_on_frame")
 _TRANSPORT_POSES = (
     *("payload_pos", "payload_quat", "trash_pos", "trash_quat", "lid_handle_pos", "lid_handle_quat"),
@@ -145,45 +123,52 @@ _EYE = "robot0_eye_in_hand"
 _ROBOT = "robot0_robotview"
 
 TASKS: dict[str, RobomimicTask] = {
-    "lift": _task(
-        "Lift",
-        "Lift the cube.",
-        _CUBE,
-        _CUBE,  # with the last one negated
+    "lift": RobomimicTask(
+        description="Lift the cube.",
+        robosuite_name="Lift",
+        environment_state_dim=10,
+        object_keys=("cube_pos", "cube_quat", "gripper_to_cube_pos"),
+        object_keys_v141=("cube_pos", "cube_quat", "gripper_to_cube_pos"),  # the last of opposite sign
         cameras=("agentview", _EYE),
         more_cameras=("frontview", "birdview", "sideview", _ROBOT),
     ),
-    "can": _task(
-        "PickPlaceCan",
-        "Put the can into its compartment of the other bin.",
-        _poses("Can"),
-        _poses_v141("Can"),
+    "can": RobomimicTask(
+        description="Put the can into its compartment of the other bin.",
+        robosuite_name="PickPlaceCan",
+        environment_state_dim=14,
+        object_keys=_poses("Can"),
+        object_keys_v141=_poses_v141("Can"),
         cameras=("agentview", _EYE),
         more_cameras=("frontview", "birdview", _ROBOT),
     ),
-    "square": _task(
-        "NutAssemblySquare",
-        "Put the square nut onto the square peg.",
-        _poses("SquareNut"),
-        _poses_v141("SquareNut"),
+    "square": RobomimicTask(
+        description="Put the square nut onto the square peg.",
+        robosuite_name="NutAssemblySquare",
+        environment_state_dim=14,
+        object_keys=_poses("SquareNut"),
+        object_keys_v141=_poses_v141("SquareNut"),
         cameras=("agentview", _EYE),
         more_cameras=("frontview", "birdview", "sideview", _ROBOT),
     ),
-    "transport": _task(
-        "TwoArmTransport",
-        "Hand the hammer from bin to bin and clear the trash out of its way.",
-        (*_TRANSPORT_POSES, *_TRANSPORT_FLAGS, *_TRANSPORT_VECTORS),
-        (*_TRANSPORT_POSES, *_TRANSPORT_VECTORS, *_TRANSPORT_FLAGS),
+    "transport": RobomimicTask(
+        description="Hand the hammer from bin to bin and clear the trash out of its way.",
+        robosuite_name="TwoArmTransport",
+        n_robots=2,
+        action_dim=14,
+        agent_pos_dim=18,
+        environment_state_dim=41,
+        object_keys=(*_TRANSPORT_POSES, *_TRANSPORT_FLAGS, *_TRANSPORT_VECTORS),
+        object_keys_v141=(*_TRANSPORT_POSES, *_TRANSPORT_VECTORS, *_TRANSPORT_FLAGS),
         cameras=("shouldercamera0", "shouldercamera1", _EYE, "robot1_eye_in_hand"),
         more_cameras=("frontview", "birdview", "agentview", "sideview", _ROBOT, "robot1_robotview"),
         episode_length=700,
-        n_robots=2,
     ),
-    "tool_hang": _task(
-        "ToolHang",
-        "Assemble the frame on the stand and hang the tool on it.",
-        (*_poses("base", "frame", "tool"), *_HANGING_FLAGS),
-        (*_poses_v141("base", "frame", "tool"), *_HANGING_FLAGS),
+    "tool_hang": RobomimicTask(
+        description="Assemble the frame on the stand and hang the tool on it.",
+        robosuite_name="ToolHang",
+        environment_state_dim=44,
+        object_keys=(*_poses("base", "frame", "tool"), *_HANGING_FLAGS),
+        object_keys_v141=(*_poses_v141("base", "frame", "tool"), *_HANGING_FLAGS),
         cameras=("sideview", _EYE),
         more_cameras=("frontview", "birdview", "agentview", _ROBOT),
         episode_length=700,

@@ -23,14 +23,14 @@ class RoboticsTask(TaskSpec):
     Attributes:
         agent: indices into the flat observation that make up `agent_pos`, in order.
         scene: indices that make up `environment_state`.
-        goal_dim: length of the desired goal that is appended to them; 0 for a task without one.
         success: of the unwrapped environment, the raw observation and the info of a step or a reset.
+        goal_dim: length of the desired goal that is appended to `environment_state`; 0 for a task without one.
     """
 
     agent: Sequence[int]
     scene: Sequence[int]
-    goal_dim: int
     success: Success
+    goal_dim: int = 0
 
     def split(self, observation: RawObservation) -> tuple[np.ndarray, np.ndarray]:
         """Split one observation into `agent_pos` (agent_pos_dim,) and `environment_state` (environment_state_dim,).
@@ -38,35 +38,10 @@ class RoboticsTask(TaskSpec):
         Args:
             observation: flat (D,), or a goal dictionary with `observation` (D,) and `desired_goal` (goal_dim,).
         """
-        if not isinstance(observation, dict):
-            return observation[self.agent], observation[self.scene]
-        flat = observation["observation"]
-        goal = observation["desired_goal"] if self.goal_dim else []
-        return flat[self.agent], np.concatenate([flat[self.scene], goal])
-
-
-def _task(
-    description: str,
-    agent: Sequence[int],
-    scene: Sequence[int],
-    action_dim: int,
-    fps: int,
-    episode_length: int,
-    success: Success,
-    goal_dim: int = 0,
-) -> RoboticsTask:
-    return RoboticsTask(
-        description=description,
-        fps=fps,
-        episode_length=episode_length,
-        action_dim=action_dim,
-        agent_pos_dim=len(agent),
-        environment_state_dim=len(scene) + goal_dim,
-        agent=list(agent),
-        scene=list(scene),
-        goal_dim=goal_dim,
-        success=success,
-    )
+        flat, goal = observation, []
+        if isinstance(observation, dict):
+            flat, goal = observation["observation"], observation["desired_goal"] if self.goal_dim else []
+        return np.take(flat, self.agent), np.concatenate([flat[list(self.scene)], goal])
 
 
 def _goal_reached(env: Any, observation: RawObservation, info: dict[str, Any]) -> bool:
@@ -85,22 +60,41 @@ def _all_tasks_done(env: Any, observation: RawObservation, info: dict[str, Any])
     return set(env.goal) <= set(info["episode_task_completions"])
 
 
-def _fetch(description: str, has_object: bool = True) -> RoboticsTask:
-    """Grip position (3), finger displacements (2), grip velocity (3), finger velocities (2) are the arm's.
-
-    With an object, its position (3:6), position from the grip (6:9), rotation (11:14), velocity from the grip (14:17)
-    and angular velocity (17:20) lie between them.
-    """
-    agent = [0, 1, 2, 9, 10, 20, 21, 22, 23, 24] if has_object else range(10)
-    scene = [*range(3, 9), *range(11, 20)] if has_object else []
-    return _task(description, agent, scene, 4, fps=25, episode_length=50, success=_goal_reached, goal_dim=3)
+def _fetch(description: str, agent: Sequence[int], scene: Sequence[int]) -> RoboticsTask:
+    return RoboticsTask(
+        description=description,
+        fps=25,
+        episode_length=50,
+        action_dim=4,
+        agent_pos_dim=len(agent),
+        environment_state_dim=len(scene) + 3,
+        agent=agent,
+        scene=scene,
+        goal_dim=3,
+        success=_goal_reached,
+    )
 
 
 def _adroit(description: str, agent: Sequence[int], dim: int, action_dim: int) -> RoboticsTask:
     """Of an observation (dim,), all that is not the hand's belongs to the scene."""
-    scene = sorted(set(range(dim)) - set(agent))
-    return _task(description, agent, scene, action_dim, fps=100, episode_length=200, success=_adroit_success)
+    return RoboticsTask(
+        description=description,
+        fps=100,
+        episode_length=200,
+        action_dim=action_dim,
+        agent_pos_dim=len(agent),
+        environment_state_dim=dim - len(agent),
+        agent=agent,
+        scene=sorted(set(range(dim)) - set(agent)),
+        success=_adroit_success,
+    )
 
+
+# Grip position (3), finger displacements (2), grip velocity (3), finger velocities (2): an arm alone has these only.
+_ARM = (range(10), ())
+# With an object, its position (3:6), position from the grip (6:9), rotation (11:14), velocity from the grip (14:17)
+# and angular velocity (17:20) lie between them.
+_ARM_AND_OBJECT = ((0, 1, 2, 9, 10, 20, 21, 22, 23, 24), (*range(3, 9), *range(11, 20)))
 
 KITCHEN = "FrankaKitchen-v1"
 KitchenTask = Literal[
@@ -116,10 +110,12 @@ KITCHEN_DEFAULT: tuple[KitchenTask, ...] = ("microwave", "kettle", "light switch
 """The four of D4RL's `kitchen-complete` (arXiv:2004.07219)."""
 
 TASKS: dict[str, RoboticsTask] = {
-    "FetchReach-v4": _fetch("Move the gripper to the target position.", has_object=False),
-    "FetchPush-v4": _fetch("Push the block to the target position on the table."),
-    "FetchPickAndPlace-v4": _fetch("Pick up the block and bring it to the target position."),
-    "FetchSlide-v4": _fetch("Hit the puck so that it slides to the target position."),
+    "FetchReach-v4": _fetch("Move the gripper to the target position.", *_ARM),
+    "FetchPush-v4": _fetch("Push the block to the target position on the table.", *_ARM_AND_OBJECT),
+    "FetchPickAndPlace-v4": _fetch(
+        "Pick up the block and bring it to the target position.", *_ARM_AND_OBJECT
+    ),
+    "FetchSlide-v4": _fetch("Hit the puck so that it slides to the target position.", *_ARM_AND_OBJECT),
     # Arm, wrist and finger joints, and the position of the palm where it is observed; relocate observes the palm
     # only from the ball and from the target.
     "AdroitHandDoor-v1": _adroit(
@@ -139,13 +135,15 @@ TASKS: dict[str, RoboticsTask] = {
     ),
     # Joint positions (9) and velocities (9); then positions (21) and velocities (20) of everything that moves. The
     # goal is the same in every episode and left out: as a constant it would say nothing. 12.5 steps per second.
-    KITCHEN: _task(
-        "Complete the kitchen tasks.",
-        range(18),
-        range(18, 59),
-        action_dim=9,
+    KITCHEN: RoboticsTask(
+        description="Complete the kitchen tasks.",
         fps=12,
         episode_length=280,
+        action_dim=9,
+        agent_pos_dim=18,
+        environment_state_dim=41,
+        agent=range(18),
+        scene=range(18, 59),
         success=_all_tasks_done,
     ),
 }
