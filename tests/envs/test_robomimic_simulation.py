@@ -205,7 +205,7 @@ def test_states_are_seen_whatever_is_observed_and_no_renderer_is_opened_for_them
     env = make("lift")
     roll(env, 0)
     assert set(env.state) == {AGENT_POS, ENVIRONMENT_STATE}
-    assert not env.scene_renderer.is_open
+    assert not env.scene_renderer.renderers
     assert env.simulation.sim._render_context_offscreen is None
 
 

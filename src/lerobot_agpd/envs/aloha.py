@@ -20,8 +20,8 @@ ObsType = Literal[
 ]
 
 
-def _task(task: Task, n_objects: int) -> TaskSpec:
-    return TaskSpec(
+TASKS = {
+    task: TaskSpec(
         description=DESCRIPTIONS[f"gym_aloha/{task}"],
         fps=50,
         episode_length=400,
@@ -29,11 +29,7 @@ def _task(task: Task, n_objects: int) -> TaskSpec:
         agent_pos_dim=14,
         environment_state_dim=7 * n_objects,
     )
-
-
-TASKS = {
-    "AlohaTransferCube-v0": _task("AlohaTransferCube-v0", n_objects=1),
-    "AlohaInsertion-v0": _task("AlohaInsertion-v0", n_objects=2),
+    for task, n_objects in (("AlohaTransferCube-v0", 1), ("AlohaInsertion-v0", 2))
 }
 
 

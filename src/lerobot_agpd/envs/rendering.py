@@ -19,7 +19,11 @@ Camera = mujoco.MjvCamera | int | str
 
 
 class SceneRenderer:
-    """Renders scenes of one model."""
+    """Renders scenes of one model.
+
+    Attributes:
+        renderers: one per size of image that has been rendered, with a graphics context each.
+    """
 
     def __init__(self, shadows: bool, hidden_group: int | None) -> None:
         """Open no graphics context yet.
@@ -32,12 +36,7 @@ class SceneRenderer:
         self._option = mujoco.MjvOption()
         if hidden_group is not None:
             self._option.geomgroup[hidden_group] = 0
-        self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
-
-    @property
-    def is_open(self) -> bool:
-        """Whether an image has been rendered."""
-        return bool(self._renderers)
+        self.renderers: dict[tuple[int, int], mujoco.Renderer] = {}
 
     def render(
         self, model: mujoco.MjModel, data: mujoco.MjData, camera: Camera, size: tuple[int, int]
@@ -53,20 +52,20 @@ class SceneRenderer:
         Returns:
             (height, width, 3) uint8.
         """
-        if size not in self._renderers:
+        if size not in self.renderers:
             buffer = model.vis.global_
             buffer.offheight, buffer.offwidth = max(buffer.offheight, size[0]), max(buffer.offwidth, size[1])
-            self._renderers[size] = mujoco.Renderer(model, *size)
-            self._renderers[size].scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._shadows
-        renderer = self._renderers[size]
+            self.renderers[size] = mujoco.Renderer(model, *size)
+            self.renderers[size].scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._shadows
+        renderer = self.renderers[size]
         renderer.update_scene(data, camera, self._option)
         return renderer.render()
 
     def close(self) -> None:
         """Free the graphics contexts; the next image opens one again."""
-        for renderer in self._renderers.values():
+        for renderer in self.renderers.values():
             renderer.close()
-        self._renderers.clear()
+        self.renderers.clear()
 
 
 class ViewedEnv(gym.Env):

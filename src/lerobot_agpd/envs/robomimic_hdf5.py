@@ -134,27 +134,24 @@ class RobomimicFile(AbstractContextManager["RobomimicFile"]):
             ValueError: naming the flag, if the file has no such demonstration or mask.
         """
         if filter_key is not None:
+            chosen = set(self.masks.get(filter_key, ()))
+            problem = None
             if filter_key not in self.masks:
-                raise ValueError(
-                    f"--filter_key={filter_key}: {self.path} has the masks {list(self.masks) or 'none'}"
-                )
-            absent = sorted(set(self.masks[filter_key]) - set(self.demos))
-            if absent:
-                raise ValueError(f"--filter_key={filter_key} names {absent}, which {self.path} does not hold")
-            if not self.masks[filter_key]:
-                raise ValueError(
-                    f"--filter_key={filter_key}: this mask of {self.path} selects no demonstration"
-                )
-            return [demo for demo in self.demos if demo in set(self.masks[filter_key])]
-        if episodes is None:
-            return list(self.demos)
-        outside = [episode for episode in episodes if not 0 <= episode < len(self.demos)]
+                problem = f"{self.path} has the masks {list(self.masks) or 'none'}"
+            elif absent := sorted(chosen - set(self.demos)):
+                problem = f"this mask names {absent}, which {self.path} does not hold"
+            elif not chosen:
+                problem = f"this mask of {self.path} selects no demonstration"
+            if problem:
+                raise ValueError(f"--filter_key={filter_key}: {problem}")
+            return [demo for demo in self.demos if demo in chosen]
+        n_demos = len(self.demos)
+        outside = [episode for episode in episodes or () if not 0 <= episode < n_demos]
         if outside:
             raise ValueError(
-                f"--episodes={outside}: {self.path} has {len(self.demos)} demonstrations, "
-                f"0 to {len(self.demos) - 1}"
+                f"--episodes={outside}: {self.path} has {n_demos} demonstrations, 0 to {n_demos - 1}"
             )
-        return [self.demos[episode] for episode in episodes]
+        return self.demos if episodes is None else [self.demos[episode] for episode in episodes]
 
     def observation_shapes(self, demo: str) -> dict[str, tuple[int, ...]]:
         """Shape of one step of every observation of a demonstration.

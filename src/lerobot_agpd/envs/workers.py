@@ -30,11 +30,9 @@ def register_task_descriptions() -> None:
             importlib.import_module(env_id.split("/")[0])
         except ModuleNotFoundError:
             continue
-        spec = gym.spec(env_id)
         entry_point = f"{__name__}:{TaskDescription.__name__}"
-        if all(wrapper.entry_point != entry_point for wrapper in spec.additional_wrappers):
-            wrapper = WrapperSpec(TaskDescription.__name__, entry_point, {"description": description})
-            spec.additional_wrappers += (wrapper,)
+        wrapper = WrapperSpec(TaskDescription.__name__, entry_point, {"description": description})
+        gym.spec(env_id).additional_wrappers += (wrapper,)
 
 
 register_task_descriptions()
