@@ -210,7 +210,7 @@ def test_choices_are_checked_wherever_they_come_from(kind, capsys):
     with pytest.raises(SystemExit):
         draccus.parse(Command, args=[f"--env.type={name}", "--help"])
     text = capsys.readouterr().out
-    assert "--env.obs_type {" in text and "what is observed" in text
+    assert "--env.obs_type {" in text and "What is observed" in text
 
 
 @every_type
