@@ -63,4 +63,5 @@ class AlohaStateEnvConfig(SimulatedEnvConfig):
         require_packages(["gym_aloha"], "--env.type=aloha_state", extra="aloha")
         from lerobot_agpd.envs.aloha_sim import AlohaStateEnv
 
+        assert self.episode_length is not None  # filled in by __post_init__
         return gym.wrappers.TimeLimit(AlohaStateEnv(str(self.task), self.view), self.episode_length)

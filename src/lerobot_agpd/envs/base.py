@@ -100,7 +100,7 @@ def choices_of(annotation: Any) -> tuple[str, ...]:
 class SimulatedEnvConfig(EnvConfig):
     """Options of every environment type here.
 
-    A type names its `tasks`, has the options `task` and `obs_type` (and perhaps cameras), and builds an environment.
+    A type names its `tasks`, the choices of `task` and `obs_type` (and perhaps cameras), and builds an environment.
     """
 
     tasks: ClassVar[Mapping[str, TaskSpec]]
@@ -110,7 +110,7 @@ class SimulatedEnvConfig(EnvConfig):
     # Steps after which an episode is truncated; default: the task's own limit.
     episode_length: int | None = None
     # What is observed.
-    obs_type: ObsType = "state"
+    obs_type: str = "state"
     # Height of observed images, pixels.
     observation_height: int = 96
     # Width of observed images, pixels.

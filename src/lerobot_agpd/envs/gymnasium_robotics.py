@@ -16,7 +16,7 @@ import gymnasium as gym
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_agpd.config import require
-from lerobot_agpd.envs.base import SimulatedEnvConfig
+from lerobot_agpd.envs.base import ObsType, SimulatedEnvConfig
 from lerobot_agpd.envs.packages import require_packages
 from lerobot_agpd.envs.robotics_tasks import KITCHEN, KITCHEN_DEFAULT, TASKS, KitchenTask
 
@@ -42,6 +42,8 @@ class GymnasiumRoboticsEnv(SimulatedEnvConfig):
 
     # Task of Gymnasium-Robotics.
     task: Task | None = "FetchPickAndPlace-v4"
+    # What is observed.
+    obs_type: ObsType = "state"
     # FrankaKitchen-v1 only: the tasks that make a success, e.g. "[kettle]"; default: D4RL's kitchen-complete.
     tasks_to_complete: list[KitchenTask] | None = None
 

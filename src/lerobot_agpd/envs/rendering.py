@@ -14,7 +14,7 @@ import numpy as np
 
 from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS, TaskSpec, View
 
-Camera = mujoco.MjvCamera | int | str
+type Camera = mujoco.MjvCamera | int | str
 """A camera, or the number or name of one of the model's."""
 
 

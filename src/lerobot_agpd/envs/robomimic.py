@@ -10,7 +10,7 @@ from typing import Literal
 import gymnasium as gym
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_agpd.envs.base import SimulatedEnvConfig, require_choice
+from lerobot_agpd.envs.base import ObsType, SimulatedEnvConfig, require_choice
 from lerobot_agpd.envs.packages import require_packages
 from lerobot_agpd.envs.robomimic_tasks import TASKS
 
@@ -26,6 +26,8 @@ class RobomimicEnvConfig(SimulatedEnvConfig):
 
     # Task of robomimic.
     task: Task | None = "lift"
+    # What is observed.
+    obs_type: ObsType = "state"
     # Cameras to observe, e.g. "[agentview]"; default: those of robomimic's image datasets.
     cameras: list[str] | None = None
     # Height of observed images, pixels; robomimic has 240 for tool_hang.
@@ -55,4 +57,5 @@ class RobomimicEnvConfig(SimulatedEnvConfig):
         require_packages(modules, "--env.type=robosuite_robomimic", extra="robomimic")
         from lerobot_agpd.envs.robosuite_sim import RobosuiteEnv
 
+        assert self.episode_length is not None  # filled in by __post_init__
         return gym.wrappers.TimeLimit(RobosuiteEnv(str(self.task), self.view), self.episode_length)

@@ -38,10 +38,11 @@ class RoboticsTask(TaskSpec):
         Args:
             observation: flat (D,), or a goal dictionary with `observation` (D,) and `desired_goal` (goal_dim,).
         """
-        flat, goal = observation, []
-        if isinstance(observation, dict):
-            flat, goal = observation["observation"], observation["desired_goal"] if self.goal_dim else []
-        return np.take(flat, self.agent), np.concatenate([flat[list(self.scene)], goal])
+        if not isinstance(observation, dict):
+            observation = {"observation": observation}
+        flat = observation["observation"]
+        goal = observation["desired_goal"] if self.goal_dim else []
+        return flat[list(self.agent)], np.concatenate([flat[list(self.scene)], goal])
 
 
 def _goal_reached(env: Any, observation: RawObservation, info: dict[str, Any]) -> bool:
