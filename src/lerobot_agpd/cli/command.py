@@ -5,8 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from argparse import ArgumentError
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
 from typing import get_type_hints
@@ -24,44 +23,37 @@ logger = logging.getLogger(__name__)
 WRONG_INPUT = (ValueError, FileNotFoundError, FileExistsError, ModuleNotFoundError, ArgumentError)
 
 
-def entry_point[C](name: str) -> Callable[[Callable[[C], None]], Callable[[], None]]:
-    """Make a console entry point of a function whose only parameter is a dataclass of flags.
+def entry_point[C](name: str, positional: str = "") -> Callable[[Callable[[C], None]], Callable[[], None]]:
+    """Make a console entry point of a function whose parameter `config` is a dataclass of flags.
 
-    `--<field>.discover_packages_path=<package>` imports a package that registers types, as in LeRobot's commands, and
-    `--<field>.path` is left to the `__post_init__` of a dataclass that names the field in `__get_path_fields__`.
+    Wrong input ends the command with one line instead of a traceback. `--<field>.discover_packages_path=<package>`
+    imports a package that registers types, as in LeRobot's commands; `--<field>.path` is left to the `__post_init__`
+    of a dataclass that names the field in `__get_path_fields__`.
 
     Args:
         name: of the command, as error messages begin.
+        positional: flag whose name may be left out before the first word.
     """
 
     def decorate(function: Callable[[C], None]) -> Callable[[], None]:
         @wraps(function)
         def main() -> None:
-            (config_class,) = (kind for key, kind in get_type_hints(function).items() if key != "return")
-            with command(name):
-                function(_parse(config_class, sys.argv[1:]))
+            init_logging()
+            register_third_party_plugins()
+            try:
+                args = sys.argv[1:]
+                if positional and args and not args[0].startswith("-"):
+                    args[0] = f"--{positional}={args[0]}"
+                function(_parse(get_type_hints(function)["config"], args))
+            except DraccusException as error:  # hides the message of a `__post_init__`
+                sys.exit(f"{name}: {reason(error)}")
+            except WRONG_INPUT as error:
+                logger.debug("the traceback:", exc_info=True)
+                sys.exit(f"{name}: {error}")
 
         return main
 
     return decorate
-
-
-@contextmanager
-def command(name: str) -> Iterator[None]:
-    """Set up logging and plugins; wrong input ends the command with one line instead of a traceback.
-
-    Args:
-        name: of the command, as the line begins.
-    """
-    init_logging()
-    register_third_party_plugins()
-    try:
-        yield
-    except DraccusException as error:  # hides the message of a `__post_init__`
-        sys.exit(f"{name}: {reason(error)}")
-    except WRONG_INPUT as error:
-        logger.debug("the traceback:", exc_info=True)
-        sys.exit(f"{name}: {error}")
 
 
 def _parse[C](config_class: type[C], args: list[str]) -> C:

@@ -2,7 +2,7 @@
 
 import json
 import logging
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import draccus
@@ -10,7 +10,6 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig
 from rich.console import Console
-from rich.table import Table
 
 from lerobot_agpd.agpd import make_strategy
 from lerobot_agpd.cli.command import checkpoint_of_policy_flag, entry_point
@@ -22,6 +21,7 @@ from lerobot_agpd.rollout.diagnostics import ObservationReservoir
 from lerobot_agpd.rollout.strategies import Strategy
 from lerobot_agpd.studies.frontier import plot_frontier, plot_trajectories
 from lerobot_agpd.studies.sweep import Setting, Sweep, SweepRow, configured
+from lerobot_agpd.studies.tables import console_table
 
 logger = logging.getLogger(__name__)
 
@@ -112,17 +112,15 @@ def sweep_settings(config: DiversityConfig) -> tuple[list[SweepRow], dict[str, l
         rows.append(sweep.measure(setting, strategy(setting), episodes, history, student_states))
         if setting.strategy in ("teacher", "guided"):
             shown[setting.strategy] = episodes
-        logger.info("%s", json.dumps(rows[-1].to_json()))
+        logger.info("%s", json.dumps(asdict(rows[-1])))
     return rows, shown
 
 
-def console_table(rows: list[SweepRow]) -> Table:
+def sweep_table(rows: list[SweepRow]) -> list[tuple[str, ...]]:
     """The sweep for the console."""
-    table = Table(
-        "strategy", "strength", "success", "rms to teacher", "rms to student", "entropy", "coverage"
-    )
-    for row in rows:
-        table.add_row(
+    header = ("strategy", "strength", "success", "rms to teacher", "rms to student", "entropy", "coverage")
+    body = [
+        (
             row.setting.strategy,
             f"{row.setting.strength:g}",
             f"{row.success:.2f}",
@@ -131,7 +129,9 @@ def console_table(rows: list[SweepRow]) -> Table:
             "-" if row.entropy is None else f"{row.entropy:.2f}",
             f"{row.coverage:.2f}",
         )
-    return table
+        for row in rows
+    ]
+    return [header, *body]
 
 
 @entry_point("lerobot-agpd-diversity")
@@ -144,12 +144,12 @@ def main(config: DiversityConfig) -> None:
         "policy": str(config.policy.pretrained_path) if config.policy else "",
         "first_seed": config.seed,
         "episodes": config.episodes,
-        "rows": [row.to_json() for row in rows],
+        "rows": [asdict(row) for row in rows],
     }
     write_json(config.output / "sweep.json", content, indent=1)
     plot_frontier(content["rows"], config.output / "frontier.png")
     plot_trajectories(shown, (config.axes[0], config.axes[1]), config.output / "trajectories.png")
-    Console().print(console_table(rows))
+    Console().print(console_table(sweep_table(rows)))
     logger.info("numbers and pictures in %s", config.output)
 
 

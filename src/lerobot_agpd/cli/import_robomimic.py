@@ -6,18 +6,15 @@ recordings in full precision with simulator states and models, for replaying the
 
 import json
 import logging
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import draccus
-from datasets import disable_progress_bars
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_agpd.cli.command import command
-from lerobot_agpd.cli.progress import episode_bar
+from lerobot_agpd.cli.command import entry_point
+from lerobot_agpd.cli.datasets import NewDataset, finish, write
 from lerobot_agpd.dataset_writer import DatasetWriter
 from lerobot_agpd.envs.robomimic_columns import DONES, REWARDS, RobomimicColumns, cameras_of, task_of
 from lerobot_agpd.envs.robomimic_hdf5 import RobomimicFile, sha256
@@ -30,13 +27,11 @@ REPORT_PATH = Path("meta/robomimic.json")
 
 
 @dataclass
-class ImportRobomimicConfig:
+class ImportRobomimicConfig(NewDataset):
     """Options of `lerobot-agpd-import-robomimic`; `--source=` may be left out before the first word."""
 
     # robomimic's file with observations, such as low_dim_v15.hdf5.
     source: Path
-    # Folder of the new dataset; must not exist.
-    root: Path
     # Name of the new dataset.
     repo_id: str = "local/robomimic"
     # Episodes to keep, e.g. "[0,1]", demo_0 first; default: all.
@@ -53,8 +48,6 @@ class ImportRobomimicConfig:
     video: bool = False
     # A killed import goes on, and repeats at most this many episodes.
     episodes_per_shard: int = 20
-    # Upload the dataset when it is done.
-    push_to_hub: bool = False
 
     def __post_init__(self) -> None:
         """Check the options.
@@ -64,10 +57,9 @@ class ImportRobomimicConfig:
             FileExistsError: if `root` exists.
             FileNotFoundError: if `source` is not a file.
         """
+        super().__post_init__()
         if not self.source.is_file():
             raise FileNotFoundError(f"--source={self.source} is not a file; expected robomimic's .hdf5")
-        if self.root.exists():
-            raise FileExistsError(f"--root={self.root} already exists; choose a new folder")
         if self.episodes is not None and self.filter_key is not None:
             raise ValueError("give either --episodes or --filter_key, not both")
         if self.episodes is not None and (not self.episodes or len(set(self.episodes)) < len(self.episodes)):
@@ -163,8 +155,7 @@ def import_robomimic(config: ImportRobomimicConfig) -> LeRobotDataset:
             plan={"source": digest, "demos": demos},
             episodes_per_shard=config.episodes_per_shard,
         )
-        with episode_bar("episodes", len(demos)) as advance:
-            return writer.write(map(columns.frames, demos), lambda: advance(1), add_provenance)
+        return write(writer, map(columns.frames, demos), len(demos), add_provenance)
 
 
 def warn_about_replays(file: RobomimicFile, demos: Sequence[str]) -> None:
@@ -180,27 +171,10 @@ def warn_about_replays(file: RobomimicFile, demos: Sequence[str]) -> None:
         logger.warning("%s lacks states or model_file of %s: they cannot be replayed", file.path, lacking)
 
 
-@draccus.wrap()
-def run(config: ImportRobomimicConfig) -> None:
+@entry_point("lerobot-agpd-import-robomimic", positional="source")
+def main(config: ImportRobomimicConfig) -> None:
     """Import, report and optionally upload."""
-    dataset = import_robomimic(config)
-    logger.info("%d episodes, %d frames in %s", dataset.num_episodes, dataset.num_frames, config.root)
-    if config.push_to_hub:
-        dataset.push_to_hub()
-
-
-def with_source_flag(arguments: Sequence[str]) -> list[str]:
-    """Turn a first word into `--source=`, since draccus knows no positional arguments."""
-    if arguments and not arguments[0].startswith("-"):
-        return [f"--source={arguments[0]}", *arguments[1:]]
-    return list(arguments)
-
-
-def main() -> None:
-    """Console entry point."""
-    disable_progress_bars()  # one bar of the datasets library per episode would tear ours apart
-    with command("lerobot-agpd-import-robomimic"):
-        run(draccus.parse(ImportRobomimicConfig, args=with_source_flag(sys.argv[1:])))
+    finish(import_robomimic(config), config.push_to_hub)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot_agpd.config import require
+from lerobot_agpd.config import FlagError, require
 from lerobot_agpd.studies.matrix import Matrix, TaskEntry, flat
 from lerobot_agpd.studies.parsing import decode_environment, parse_train_flags
 
@@ -115,17 +115,13 @@ def check(matrix: Matrix, runs: Sequence[Run]) -> None:
             missing = _missing(run)
             require(not missing, f"{', '.join(missing)} does not exist")
             if not run.policy:
-                check_flags(run)
-        except ValueError as error:
+                _check_flags(run)
+        except (ValueError, FlagError) as error:
             raise ValueError(f"task '{run.task}', method '{run.method}': {error}") from error
 
 
-def check_flags(run: Run) -> None:
-    """Parse a run's flags.
-
-    Raises:
-        ValueError: for a flag or value that LeRobot refuses, or one that a comparison cannot have.
-    """
+def _check_flags(run: Run) -> None:
+    """Refuse a flag or value that LeRobot refuses, or one that a comparison cannot have."""
     config = parse_train_flags(run.args)
     require(
         not getattr(config.policy, "push_to_hub", False),
