@@ -6,6 +6,7 @@ import logging
 import sys
 from argparse import ArgumentError
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import wraps
 from pathlib import Path
 from typing import get_type_hints
@@ -13,9 +14,12 @@ from typing import get_type_hints
 import draccus
 from draccus.utils import DraccusException
 from lerobot.configs import PreTrainedConfig, parser
+from lerobot.envs import EnvConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
+from lerobot_agpd.config import StudentConfig, TeacherConfig
+from lerobot_agpd.loading import require_student
 from lerobot_agpd.studies.parsing import load_plugins, reason
 
 logger = logging.getLogger(__name__)
@@ -71,12 +75,36 @@ def _parse[C](config_class: type[C], args: list[str]) -> C:
     return draccus.parse(config_class=config_class, config_path=config_path, args=args)
 
 
-def checkpoint_of_policy_flag() -> PreTrainedConfig | None:
-    """The configuration of `--policy.path=<checkpoint>` with the `--policy.*` flags beside it; None without a path."""
-    path = parser.get_path_arg("policy")
-    if not path:
-        return None
-    overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
-    config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
-    config.pretrained_path = Path(path)
-    return config
+@dataclass(kw_only=True)
+class StudentFlags:
+    """A student with the teacher that it was distilled from, and where they act."""
+
+    # Environment to act in.
+    env: EnvConfig
+    # The student: --policy.path=<checkpoint of a distilled policy>.
+    policy: PreTrainedConfig | None = None
+    # Flags that are not set are the checkpoint's.
+    teacher: TeacherConfig = field(default_factory=TeacherConfig)
+
+    def __post_init__(self) -> None:
+        """Read the checkpoint's configuration.
+
+        Raises:
+            FlagError: if there is no checkpoint, or it is of another policy.
+        """
+        path = parser.get_path_arg("policy")
+        if path:
+            overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
+            self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+            self.policy.pretrained_path = Path(path)
+        require_student(self.policy)
+
+    @classmethod
+    def __get_path_fields__(cls) -> list[str]:
+        """Fields whose `.path` the parser leaves to `__post_init__`."""
+        return ["policy"]
+
+    @property
+    def student(self) -> StudentConfig:
+        """The configuration of the student's checkpoint."""
+        return require_student(self.policy)

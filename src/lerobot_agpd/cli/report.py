@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -109,9 +110,8 @@ def main(config: ReportConfig) -> None:
     config.output.mkdir(parents=True, exist_ok=True)
     environment = draccus.encode(config.env, EnvConfig)
     results: list[Result] = []
-    with Evaluator(
-        config.env, min(config.batch_size, config.episodes), config.output, config.device
-    ) as evaluator:
+    n_envs = min(config.batch_size, config.episodes)
+    with closing(Evaluator(config.env, n_envs, config.output, config.device)) as evaluator:
         for entries, evaluate in ((config.policies, report_policy), (config.runs, report_run)):
             for name, path in entries.items():
                 results += evaluate(name, path, evaluator, config)

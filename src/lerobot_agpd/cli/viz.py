@@ -2,22 +2,21 @@
 
 import logging
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import rerun as rr
 import torch
-from lerobot.configs import PreTrainedConfig
-from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors
+from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
 from rich.console import Console
 from rich.table import Table
 
 from lerobot_agpd.agpd import GuidedStrategy
-from lerobot_agpd.cli.command import checkpoint_of_policy_flag, entry_point
-from lerobot_agpd.config import EVALUATION_SEEDS, TeacherConfig, require
-from lerobot_agpd.loading import load_pair, require_student
+from lerobot_agpd.cli.command import StudentFlags, entry_point
+from lerobot_agpd.config import EVALUATION_SEEDS, require
+from lerobot_agpd.loading import load_pair
 from lerobot_agpd.progress import REPLAY_FOLDER, Progress
 from lerobot_agpd.replay.episode import Array, EpisodeSpec
 from lerobot_agpd.rollout.report import read_reports
@@ -32,15 +31,9 @@ APPLICATION = "lerobot-agpd-viz"
 
 
 @dataclass
-class VizConfig:
+class VizConfig(StudentFlags):
     """Options of `lerobot-agpd-viz`."""
 
-    # Environment to act in.
-    env: EnvConfig
-    # The student: --policy.path=<checkpoint of a distilled policy>.
-    policy: PreTrainedConfig | None = None
-    # Flags that are not set are the checkpoint's.
-    teacher: TeacherConfig = field(default_factory=TeacherConfig)
     # Episodes to record.
     episodes: int = 1
     # Environment seed of the first episode; also seeds the noise.
@@ -60,14 +53,9 @@ class VizConfig:
         Raises:
             ValueError: if there is no checkpoint, or a number is out of range.
         """
-        self.policy = require_student(checkpoint_of_policy_flag() or self.policy)
+        super().__post_init__()
         require(self.episodes >= 1, f"--episodes must be at least 1, got {self.episodes}")
         require(self.scale is None or self.scale >= 0, f"--scale must not be negative, got {self.scale}")
-
-    @classmethod
-    def __get_path_fields__(cls) -> list[str]:
-        """Fields whose `.path` the parser leaves to `__post_init__`."""
-        return ["policy"]
 
 
 # ---- student and teacher ----
@@ -79,7 +67,7 @@ def make_guided_strategy(config: VizConfig) -> GuidedStrategy:
     Raises:
         FlagError: if teacher, student and environment do not fit together.
     """
-    student_config = require_student(config.policy)
+    student_config = config.student
     sampler, teacher = load_pair(student_config, config.teacher, config.env)
     noise = torch.Generator(device=student_config.device or "cpu").manual_seed(config.seed)
     return GuidedStrategy(sampler.pair_with(teacher), noise, student_config.guidance)
@@ -89,7 +77,7 @@ def guidance_scale(config: VizConfig) -> float:
     """`--scale`, else what the checkpoint's run would use in its next round, else where a run starts."""
     if config.scale is not None:
         return config.scale
-    student_config = require_student(config.policy)
+    student_config = config.student
     assert student_config.pretrained_path is not None
     try:
         progress = Progress.read(student_config.pretrained_path)

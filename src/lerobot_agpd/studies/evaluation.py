@@ -52,29 +52,25 @@ class Evaluation:
         return float(np.mean(self.values(measure)))
 
 
+@dataclass
 class Evaluator:
     """Evaluations of checkpoints in one environment, stored in a folder and reused for the same request.
 
-    A context: leaving it closes the environments, which are built when first used and kept, since that takes seconds.
+    Environments are built when first used and kept, since that takes seconds.
 
-    Args:
+    Attributes:
         env_config: where policies act.
         n_envs: environments side by side.
         folder: gets a folder `evaluations`, one file per request, named by the request's hash.
         device: where policies run.
     """
 
-    def __init__(self, env_config: EnvConfig, n_envs: int, folder: Path, device: str):
-        self.env_config = env_config
-        self.n_envs = n_envs
-        self.folder = folder / EVALUATIONS
-        self.device = device
+    env_config: EnvConfig
+    n_envs: int
+    folder: Path
+    device: str
 
-    def __enter__(self) -> Evaluator:
-        """Build nothing yet."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         """Close the environments."""
         if "environments" in self.__dict__:
             close_envs(self.environments)
@@ -102,12 +98,12 @@ class Evaluator:
             "device": self.device,
         }
         name = hashlib.sha256(json.dumps(request, sort_keys=True, default=str).encode()).hexdigest()[:16]
-        file = self.folder / f"{name}.json"
+        file = self.folder / EVALUATIONS / f"{name}.json"
         if file.is_file():
             stored = read_json(file)
             return Evaluation(**{key: stored[key] for key in stored if key != "request"})
         evaluation = self._roll_out(checkpoint_config(path, self.device, n_action_steps), episodes, seed)
-        self.folder.mkdir(parents=True, exist_ok=True)
+        file.parent.mkdir(parents=True, exist_ok=True)
         write_json(file, {"request": request, **asdict(evaluation)})
         logger.info("evaluated %s: success %s", path, success_rate(evaluation.successes))
         return evaluation

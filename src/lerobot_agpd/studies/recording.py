@@ -54,15 +54,9 @@ class RolloutRecord:
     frames: Sequence[Array] = ()
     to_frame: Callable[[Array], Array] | None = None
 
-    @property
-    def cameras(self) -> list[str]:
-        """Observations that are images."""
-        return [key for key, values in self.episode.observations.items() if values.ndim == 4]
-
-    @property
-    def vectors(self) -> list[str]:
-        """Observations that are vectors."""
-        return [key for key, values in self.episode.observations.items() if values.ndim == 2]
+    def observed(self, ndim: int) -> dict[str, Array]:
+        """Observations that are images (T, H, W, C), with 4 dimensions, or vectors (T, D), with 2."""
+        return {key: values for key, values in self.episode.observations.items() if values.ndim == ndim}
 
 
 class DecisionRecorder:

@@ -36,10 +36,10 @@ def log_rollout(stream: rr.RecordingStream, root: str, rollout: RolloutRecord) -
     episode = rollout.episode
     steps = np.arange(len(episode))
     _log_images(stream, f"{root}/frame", rollout.frames)
-    for key in rollout.cameras:
-        _log_images(stream, _observation_path(root, key), episode.observations[key])
-    for key in rollout.vectors:
-        _log_series(stream, _observation_path(root, key), steps, episode.observations[key])
+    for key, images in rollout.observed(ndim=4).items():
+        _log_images(stream, _observation_path(root, key), images)
+    for key, vectors in rollout.observed(ndim=2).items():
+        _log_series(stream, _observation_path(root, key), steps, vectors)
     _log_series(stream, f"{root}/action", steps, episode.actions)
     _log_series(stream, f"{root}/reward", steps, episode.rewards[:, None], ["reward"])
     if episode.successes is not None:
@@ -52,7 +52,7 @@ def log_rollout(stream: rr.RecordingStream, root: str, rollout: RolloutRecord) -
 
 def layout(root: str, rollout: RolloutRecord) -> rrb.Container:
     """Arrange one rollout: what happened on the left, what was planned and how it was guided on the right."""
-    pictures = [_observation_path(root, key) for key in rollout.cameras]
+    pictures = [_observation_path(root, key) for key in rollout.observed(ndim=4)]
     if len(rollout.frames) or rollout.to_frame is not None:
         pictures.insert(0, f"{root}/frame")
     n_dims = rollout.episode.actions.shape[1]
@@ -67,7 +67,10 @@ def layout(root: str, rollout: RolloutRecord) -> rrb.Container:
     )
     state = rrb.Tabs(
         rrb.TimeSeriesView(origin=f"{root}/action", name="executed actions"),
-        *(rrb.TimeSeriesView(origin=_observation_path(root, key), name=key) for key in rollout.vectors),
+        *(
+            rrb.TimeSeriesView(origin=_observation_path(root, key), name=key)
+            for key in rollout.observed(ndim=2)
+        ),
     )
     plots = rrb.Vertical(chunks, guidance, state, row_shares=[2, 1, 1])
     if not pictures:

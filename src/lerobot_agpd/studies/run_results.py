@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict
 from typing import Any
 
@@ -35,7 +36,7 @@ def evaluate_run(matrix: Matrix, run: Run) -> None:
         FlagError: if the run's training is not finished.
     """
     env_config, settings = decode_environment(matrix.tasks[run.task].env), matrix.evaluation
-    with Evaluator(env_config, settings.batch_size, run.folder, settings.device) as evaluator:
+    with closing(Evaluator(env_config, settings.batch_size, run.folder, settings.device)) as evaluator:
         measured = (_evaluate_policy if run.policy else _evaluate_training)(matrix, run, evaluator)
     rounds = read_reports(run.output_dir / REPLAY_FOLDER)
     content = {

@@ -70,20 +70,20 @@ def expand(
     ):
         unknown = [entry for entry in requested if entry not in present]
         require(not unknown, f"--{flag}: the matrix has no {unknown}; there are {present}")
+    cells = [(task, method) for task in tasks or matrix.tasks for method in methods or matrix.methods]
     runs = []
     for number, seed in enumerate(seeds or matrix.seeds):
-        for task in tasks or matrix.tasks:
-            for method in methods or matrix.methods:
-                if not matrix.methods[method].policy:
-                    runs.append(_trained(matrix, task, method, seed))
-                elif number == 0:
-                    runs.append(_evaluated(matrix, task, method))
+        for task, method in cells:
+            if not matrix.methods[method].policy:
+                runs.append(_trained(matrix, task, method, seed))
+            elif number == 0:
+                runs.append(_evaluated(matrix, task, method))
     return runs
 
 
 def _trained(matrix: Matrix, task_name: str, method_name: str, seed: int) -> Run:
     task, method = matrix.tasks[task_name], matrix.methods[method_name]
-    flags = {**flat(matrix.common), **flat({"dataset": task.dataset, "env": task.env}), **flat(task.flags)}
+    flags = flat(matrix.common) | flat({"dataset": task.dataset, "env": task.env}) | flat(task.flags)
     if method.teacher:
         flags["policy.teacher.path"] = task.teacher
     flags |= {name: _fill_in(value, task) for name, value in flat(method.flags).items()}
@@ -95,8 +95,9 @@ def _evaluated(matrix: Matrix, task_name: str, method_name: str) -> Run:
     task = matrix.tasks[task_name]
     policy = _fill_in(matrix.methods[method_name].policy, task)
     flags = {"policy.path": policy, **flat({"env": task.env})}
-    folder = matrix.output / task_name / method_name / "policy"
-    return Run(task_name, method_name, None, folder, flags, policy)
+    return Run(
+        task_name, method_name, None, matrix.output / task_name / method_name / "policy", flags, policy
+    )
 
 
 def _fill_in(value: Any, task: TaskEntry) -> Any:

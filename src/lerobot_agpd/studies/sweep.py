@@ -79,10 +79,11 @@ def configured(student_config: StudentConfig, setting: Setting) -> StudentConfig
     return config
 
 
+@dataclass(frozen=True)
 class Sweep:
     """Measure settings against each other: same environment seeds, same observations, same numbers of states.
 
-    Args:
+    Attributes:
         student_config: the student's configuration; its `collect` group filters.
         env_config: the environment.
         stats: statistics that standardize states.
@@ -90,16 +91,11 @@ class Sweep:
         noise_seed: of all sampling.
     """
 
-    def __init__(
-        self,
-        student_config: StudentConfig,
-        env_config: EnvConfig,
-        stats: Statistics,
-        seeds: Sequence[int],
-        noise_seed: int,
-    ):
-        self.student_config, self.env_config = student_config, env_config
-        self.stats, self.seeds, self.noise_seed = stats, seeds, noise_seed
+    student_config: StudentConfig
+    env_config: EnvConfig
+    stats: Statistics
+    seeds: Sequence[int]
+    noise_seed: int
 
     def episodes(
         self,

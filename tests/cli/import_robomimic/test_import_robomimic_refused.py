@@ -12,7 +12,6 @@ h5py = pytest.importorskip("h5py")
 
 from robomimic_files import ENV_ARGS, RIGHT_ARM, V141, part, run_import, write  # noqa: E402
 
-from lerobot_agpd.cli import import_robomimic as command  # noqa: E402
 from lerobot_agpd.cli.import_robomimic import ImportRobomimicConfig  # noqa: E402
 
 
@@ -154,12 +153,6 @@ def test_wrong_options_are_named(source, tmp_path):
     ):
         with pytest.raises(error, match=message):
             ImportRobomimicConfig(**{"source": source, "root": tmp_path / "data", **options})
-
-
-def test_only_a_first_word_is_the_source():
-    assert command.with_source_flag(["a.hdf5", "--root=b"]) == ["--source=a.hdf5", "--root=b"]
-    assert command.with_source_flag(["--root=b", "--source=a"]) == ["--root=b", "--source=a"]
-    assert command.with_source_flag([]) == []
 
 
 def test_missing_h5py_names_the_extra(source, tmp_path, monkeypatch):
