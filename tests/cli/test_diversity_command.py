@@ -7,6 +7,7 @@ import pytest
 from lerobot.envs.configs import PushtEnv
 
 from lerobot_agpd.cli import diversity
+from lerobot_agpd.config import FlagError
 
 pytest.importorskip("gym_pusht")
 
@@ -59,5 +60,5 @@ def test_sweep_measures_every_setting(monkeypatch, student, tmp_path):
 )
 def test_wrong_options_are_refused(monkeypatch, student, tmp_path, options, message):
     monkeypatch.setattr(sys, "argv", ["lerobot-agpd-diversity", f"--policy.path={student}"])
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(FlagError, match=message):
         diversity.DiversityConfig(env=PushtEnv(), output=tmp_path, **options)

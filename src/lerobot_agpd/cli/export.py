@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot.configs import PreTrainedConfig
-from lerobot.policies import PreTrainedPolicy, make_pre_post_processors
+from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
@@ -35,16 +35,10 @@ class ExportConfig:
     checkpoint: str
     # Folder of the plain checkpoint; must not exist.
     output: Path
-    # Hub repository to upload to.
-    repo_id: str | None = None
-    # Upload the result.
-    push_to_hub: bool = False
 
     def __post_init__(self) -> None:
         if self.output.exists():
             raise FileExistsError(f"--output={self.output} already exists; choose a new folder")
-        if self.push_to_hub and not self.repo_id:
-            raise ValueError("--push_to_hub=true needs --repo_id")
 
 
 def as_plain(policy: PreTrainedPolicy) -> PreTrainedPolicy:
@@ -93,7 +87,7 @@ def largest_difference(policy: PreTrainedPolicy, plain: PreTrainedPolicy, batch_
     return float((chunks[0] - chunks[1]).abs().max())
 
 
-def export(config: ExportConfig) -> PreTrainedPolicy:
+def export(config: ExportConfig) -> None:
     """Write the plain checkpoint with its processors.
 
     Raises:
@@ -115,17 +109,12 @@ def export(config: ExportConfig) -> PreTrainedPolicy:
     logger.info(
         "%s checkpoint in %s; largest difference of actions %.1e", plain.name, config.output, difference
     )
-    return plain
 
 
 @entry_point("lerobot-agpd-export")
 def main(config: ExportConfig) -> None:
-    """Export and optionally upload."""
-    plain = export(config)
-    if config.push_to_hub:
-        plain.push_to_hub(str(config.repo_id))
-        for processor in make_pre_post_processors(plain.config, pretrained_path=str(config.output)):
-            processor.push_to_hub(str(config.repo_id))
+    """Export."""
+    export(config)
 
 
 if __name__ == "__main__":
