@@ -14,5 +14,5 @@ slow=()
 record "$output/few" "$FEW" 5000 "${env[@]}" "${slow[@]}" --skill="$SKILL"
 teacher "$output/teacher" "$output/many"
 cloning "$output/cloning" "$output/few"
-distil "$output/agpd" "$output/few" "$output/teacher" "${env[@]}"
+distill "$output/agpd" "$output/few" "$output/teacher" "${env[@]}"
 report "$output" "${env[@]}" --title="$task, $FEW demonstrations"
