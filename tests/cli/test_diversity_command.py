@@ -15,7 +15,6 @@ pytest.importorskip("gym_pusht")
 def call(monkeypatch, student, *options: str) -> None:
     flags = ["--env.type=pusht", "--env.obs_type=environment_state_agent_pos", "--env.episode_length=12"]
     flags += [f"--policy.path={student}", "--policy.collect.n_envs=3", "--policy.collect.min_reward=1e-9"]
-    flags += ["--policy.collect.diagnostics.observations=4", "--policy.collect.diagnostics.samples=3"]
     monkeypatch.setattr(sys, "argv", ["lerobot-agpd-diversity", *flags, *options])
     diversity.main()
 

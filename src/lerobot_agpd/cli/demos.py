@@ -6,25 +6,29 @@ policy reads, and `meta/demos.json` the skill of every episode.
 """
 
 import json
+import logging
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from datasets import disable_progress_bars
 from lerobot.configs import FeatureType
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import DONE, REWARD, SUCCESS
 from rich.console import Console
 from rich.table import Table
+from scipy.stats import binomtest
 
 from lerobot_agpd.cli.command import entry_point
-from lerobot_agpd.cli.datasets import NewDataset, finish, write
-from lerobot_agpd.config import EVALUATION_SEEDS
+from lerobot_agpd.cli.progress import episode_bar
+from lerobot_agpd.config import EVALUATION_SEEDS, require
 from lerobot_agpd.dataset_writer import DatasetWriter, flag, image, vector
-from lerobot_agpd.envs.base import SingleEnvConfig
+from lerobot_agpd.envs.base import SimulatedEnvConfig
 from lerobot_agpd.envs.demonstrations import SKILL, DemosReport, successful_episodes
 from lerobot_agpd.envs.experts import make_expert
-from lerobot_agpd.studies.statistics import success_rate
+
+logger = logging.getLogger(__name__)
 
 MAX_ATTEMPTS_PER_EPISODE = 10
 """Attempts per requested episode after which the command gives up."""
@@ -33,9 +37,11 @@ REPORT_PATH = Path("meta/demos.json")
 
 
 @dataclass
-class DemosConfig(NewDataset):
+class DemosConfig:
     """Options of `lerobot-agpd-demos`."""
 
+    # Folder of the new dataset; must not exist.
+    root: Path
     # Environment, whose task needs a scripted expert.
     env: EnvConfig = field(default_factory=lambda: EnvConfig.get_choice_class("gymnasium_robotics")())
     # Name of the new dataset.
@@ -46,25 +52,28 @@ class DemosConfig(NewDataset):
     seed: int = 0
     # 1 is the expert, 0 the worst operator; "[1,0.5]": two operators in turn.
     skill: float | list[float] = 1.0
+    # Upload the dataset when it is done.
+    push_to_hub: bool = False
 
     def __post_init__(self) -> None:
         """Check the options.
 
         Raises:
-            ValueError: if the task has no expert, or an option is impossible.
-            FileExistsError: if `root` exists.
+            FlagError: if an option is impossible.
+            ValueError: if the task has no expert.
         """
-        super().__post_init__()
         make_expert(self.env)
-        if not self.skills or not all(0 <= skill <= 1 for skill in self.skills):
-            raise ValueError(f"--skill={self.skill} must be one or several numbers in [0, 1].")
-        if self.episodes < 1:
-            raise ValueError(f"--episodes must be at least 1, got {self.episodes}.")
-        if self.seed < 0 or self.seed + self.episodes > EVALUATION_SEEDS[0]:
-            raise ValueError(
-                f"--seed={self.seed} with --episodes={self.episodes}: the seeds of demonstrations lie in "
-                f"[0, {EVALUATION_SEEDS[0]}); evaluations use those from {EVALUATION_SEEDS[0]} on."
-            )
+        require(
+            bool(self.skills) and all(0 <= skill <= 1 for skill in self.skills),
+            f"--skill={self.skill} must be one or several numbers in [0, 1]",
+        )
+        require(self.episodes >= 1, f"--episodes must be at least 1, got {self.episodes}")
+        require(
+            0 <= self.seed <= EVALUATION_SEEDS[0] - self.episodes,
+            f"--seed={self.seed} with --episodes={self.episodes}: the seeds of demonstrations lie in "
+            f"[0, {EVALUATION_SEEDS[0]}); evaluations use those from {EVALUATION_SEEDS[0]} on",
+        )
+        require(not self.root.exists(), f"--root={self.root} already exists; choose a new folder")
 
     @property
     def skills(self) -> list[float]:
@@ -98,7 +107,7 @@ def record_demos(config: DemosConfig) -> DemosReport:
         RuntimeError: if too few episodes succeed.
         ModuleNotFoundError: if the package of the environment is not installed.
     """
-    assert isinstance(config.env, SingleEnvConfig) and config.env.fps is not None  # as all with experts
+    assert isinstance(config.env, SimulatedEnvConfig) and config.env.fps is not None  # as all with experts
     report = DemosReport(task=str(config.env.task))
     writer = DatasetWriter(config.root, config.repo_id, config.env.fps, dataset_features(config))
 
@@ -116,16 +125,18 @@ def record_demos(config: DemosConfig) -> DemosReport:
         report,
     )
     try:
-        write(writer, episodes, config.episodes, add_report)
+        with episode_bar(report.task, config.episodes) as advance:
+            writer.write(episodes, lambda: advance(1), add_report)
     finally:
         env.close()
     return report
 
 
-def rate(successes: int, failures: int) -> str:
-    """Fraction of successes, e.g. `0.91 [0.86, 0.94], N = 120`."""
-    estimate = success_rate([True] * successes + [False] * failures)
-    return f"{estimate}, N = {estimate.n}"
+def success_rate(successes: int, failures: int) -> str:
+    """Fraction of successes with Wilson's 95 % interval, e.g. `0.91 [0.86, 0.94], N = 120`."""
+    n = successes + failures
+    interval = binomtest(successes, n).proportion_ci(method="wilson")
+    return f"{successes / n:.2f} [{interval.low:.2f}, {interval.high:.2f}], N = {n}"
 
 
 def report_table(report: DemosReport) -> Table:
@@ -140,20 +151,24 @@ def report_table(report: DemosReport) -> Table:
     table.add_row("dropped: failed", str(failed))
     table.add_row("recorded episodes", str(recorded))
     table.add_row("recorded frames", str(report.frames))
-    table.add_row("recorded per attempt", rate(recorded, report.attempts - recorded))
-    table.add_row("success rate without starts at the goal", rate(recorded, failed))
+    table.add_row("recorded per attempt", success_rate(recorded, report.attempts - recorded))
+    table.add_row("success rate without starts at the goal", success_rate(recorded, failed))
     operators = sorted({*report.skills, *report.failed_skills}, reverse=True)
     for skill in operators if operators != [1.0] else []:
-        counts = (report.skills.count(skill), report.failed_skills.count(skill))
-        table.add_row(f"  skill {skill:g}", rate(*counts))
+        rate = success_rate(report.skills.count(skill), report.failed_skills.count(skill))
+        table.add_row(f"  skill {skill:g}", rate)
     return table
 
 
 @entry_point("lerobot-agpd-demos")
 def main(config: DemosConfig) -> None:
     """Record, report and optionally upload."""
-    Console().print(report_table(record_demos(config)))
-    finish(LeRobotDataset(config.repo_id, root=config.root), config.push_to_hub)
+    disable_progress_bars()  # one bar of the datasets library per episode would tear ours apart
+    report = record_demos(config)
+    Console().print(report_table(report))
+    logger.info("%d episodes, %d frames in %s", len(report.seeds), report.frames, config.root)
+    if config.push_to_hub:
+        LeRobotDataset(config.repo_id, root=config.root).push_to_hub()
 
 
 if __name__ == "__main__":

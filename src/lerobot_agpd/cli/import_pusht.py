@@ -1,55 +1,75 @@
 """`lerobot-agpd-import-pusht`: the human Push-T demonstrations of Diffusion Policy as a LeRobotDataset."""
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from datasets import disable_progress_bars
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, DONE, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE, REWARD, SUCCESS
 
 from lerobot_agpd.cli.command import entry_point
-from lerobot_agpd.cli.datasets import NewDataset, finish, write
+from lerobot_agpd.cli.progress import episode_bar
+from lerobot_agpd.config import require
 from lerobot_agpd.dataset_writer import DatasetWriter, Frame, flag, image, vector
+from lerobot_agpd.envs.base import DESCRIPTIONS
 from lerobot_agpd.envs.pusht_recordings import IMAGE_SHAPE, Arrays, block_geometry, load_arrays
 
+logger = logging.getLogger(__name__)
+
 FPS = 10
-TASK = "Push the T-shaped block onto the T-shaped target."
+TASK = DESCRIPTIONS["gym_pusht/PushT-v0"]
 SUCCESS_COVERAGE = 0.95
 
 Variant = Literal["keypoints", "state", "image"]
 
 
 @dataclass
-class ImportPushTConfig(NewDataset):
+class ImportPushTConfig:
     """Options of `lerobot-agpd-import-pusht`."""
 
     # Diffusion Policy's replay buffer, a zarr folder or a zip of it, or its arrays in an .npz file.
     source: Path
+    # Folder of the new dataset; must not exist.
+    root: Path
     # Name of the new dataset.
     repo_id: str = "local/pusht_keypoints"
     # Observation beside the agent's position: the block's corners (keypoints) or pose (state), or a 96x96 image.
     variant: Variant = "keypoints"
-    # Keep episodes 0 to n-1; default: all.
+    # Episodes to keep, e.g. "[0,1,2]"; default: all.
+    episodes: list[int] | None = None
+    # shorthand: keep episodes 0 to n-1.
     first_episodes: int | None = None
     # .npz file with the array img, if it is not in source.
     images: Path | None = None
+    # Upload the dataset when it is done.
+    push_to_hub: bool = False
 
     def __post_init__(self) -> None:
         """Check the options.
 
         Raises:
-            ValueError: if an option is impossible.
-            FileExistsError: if `root` exists.
-            FileNotFoundError: if `source` does not.
+            FlagError: if an option is impossible.
         """
-        super().__post_init__()
+        require(not self.root.exists(), f"--root={self.root} already exists; choose a new folder")
         for name, path in (("source", self.source), ("images", self.images)):
-            if path is not None and not path.exists():
-                raise FileNotFoundError(f"--{name}={path} does not exist")
-        if self.first_episodes is not None and self.first_episodes < 1:
-            raise ValueError(f"--first_episodes must be at least 1, got {self.first_episodes}")
+            require(path is None or path.exists(), f"--{name}={path} does not exist")
+        require(
+            self.episodes is None or self.first_episodes is None,
+            "give either --episodes or --first_episodes, not both",
+        )
+        require(
+            self.first_episodes is None or self.first_episodes >= 1,
+            f"--first_episodes must be at least 1, got {self.first_episodes}",
+        )
+        if self.episodes is not None:
+            require(
+                min(self.episodes, default=-1) >= 0 and len(set(self.episodes)) == len(self.episodes),
+                f"--episodes={self.episodes} must name at least one episode, counted from 0, and none twice",
+            )
 
 
 def dataset_features(variant: Variant) -> dict[str, dict[str, Any]]:
@@ -102,23 +122,36 @@ def import_pusht(config: ImportPushTConfig) -> LeRobotDataset:
     """Write the dataset.
 
     Raises:
-        ValueError: if the source has fewer episodes than requested; see also `load_arrays`.
+        ValueError: if the source does not have a requested episode; see also `load_arrays`.
     """
     arrays = load_arrays(config.source, with_images=config.variant == "image", images=config.images)
-    ends = arrays["episode_ends"].tolist()
-    n_episodes = config.first_episodes or len(ends)
-    if n_episodes > len(ends):
-        raise ValueError(f"--first_episodes={n_episodes}: {config.source} has {len(ends)} episodes")
-    rows = map(slice, [0, *ends], ends[:n_episodes])
+    bounds = [0, *arrays["episode_ends"].tolist()]
+    n_episodes = len(bounds) - 1
+    episodes = config.episodes or range(config.first_episodes or n_episodes)
+    if max(episodes) >= n_episodes:
+        option = "--episodes" if config.episodes else "--first_episodes"
+        value = config.episodes or config.first_episodes
+        raise ValueError(
+            f"{option}={value}: {config.source} has {n_episodes} episodes, 0 to {n_episodes - 1}"
+        )
+
     writer = DatasetWriter(config.root, config.repo_id, FPS, dataset_features(config.variant))
-    frames = (episode_frames(arrays, episode, config.variant) for episode in rows)
-    return write(writer, frames, n_episodes)
+    frames = (
+        episode_frames(arrays, slice(bounds[episode], bounds[episode + 1]), config.variant)
+        for episode in episodes
+    )
+    with episode_bar("episodes", len(episodes)) as advance:
+        return writer.write(frames, lambda: advance(1))
 
 
 @entry_point("lerobot-agpd-import-pusht")
 def main(config: ImportPushTConfig) -> None:
     """Import, report and optionally upload."""
-    finish(import_pusht(config), config.push_to_hub)
+    disable_progress_bars()  # one bar of the datasets library per episode would tear ours apart
+    dataset = import_pusht(config)
+    logger.info("%d episodes, %d frames in %s", dataset.num_episodes, dataset.num_frames, config.root)
+    if config.push_to_hub:
+        dataset.push_to_hub()
 
 
 if __name__ == "__main__":

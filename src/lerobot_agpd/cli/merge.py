@@ -1,12 +1,14 @@
 """`lerobot-agpd-merge`: the episodes that a run has collected as one LeRobotDataset, and to the Hub."""
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_agpd.cli.command import entry_point
-from lerobot_agpd.cli.datasets import finish
 from lerobot_agpd.config import FlagError, require
 from lerobot_agpd.replay.export import merge
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass
@@ -31,7 +33,10 @@ def main(config: MergeConfig) -> None:
     merged = merge(config.root, config.repo_id)
     if merged is None:
         raise FlagError(f"--root={config.root} holds no kept episode")
-    finish(merged, config.push_to_hub)
+    logger.info("%d episodes, %d frames in %s", merged.num_episodes, merged.num_frames, merged.root)
+    if config.push_to_hub:
+        merged.push_to_hub()
+        logger.info("uploaded to %s", config.repo_id)
 
 
 if __name__ == "__main__":

@@ -4,8 +4,8 @@ The raw keys become `observation.state`, `observation.environment_state` and `ob
 simulation is in `aloha_sim`.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Literal
 
 import gymnasium as gym
 from lerobot.envs.configs import EnvConfig
@@ -13,12 +13,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot_agpd.envs.base import DESCRIPTIONS, SimulatedEnvConfig, TaskSpec
 from lerobot_agpd.envs.packages import require_packages
 
-Task = Literal["AlohaTransferCube-v0", "AlohaInsertion-v0"]
-Camera = Literal["top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist"]
-ObsType = Literal[
-    "environment_state_agent_pos", "pixels_agent_pos", "pixels", "pixels_environment_state_agent_pos"
-]
-
+CAMERAS = ("top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist")
 
 TASKS = {
     task: TaskSpec(
@@ -39,19 +34,30 @@ class AlohaStateEnvConfig(SimulatedEnvConfig):
     """ALOHA's simulated tasks, seen through joints and object poses, or through cameras of any size."""
 
     tasks = TASKS
+    obs_types = (
+        "environment_state_agent_pos",
+        "pixels_agent_pos",
+        "pixels",
+        "pixels_environment_state_agent_pos",
+    )
 
     # AlohaTransferCube-v0 or AlohaInsertion-v0.
-    task: Task | None = "AlohaTransferCube-v0"
-    # What is observed.
-    obs_type: ObsType = "environment_state_agent_pos"
+    task: str | None = "AlohaTransferCube-v0"
+    # What is observed: environment_state_agent_pos, pixels_agent_pos, pixels or pixels_environment_state_agent_pos.
+    obs_type: str = "environment_state_agent_pos"
     # Cameras to observe, e.g. "[top,angle]".
-    cameras: list[Camera] = field(default_factory=lambda: ["top"])
+    cameras: list[str] = field(default_factory=lambda: ["top"])
     # Height of observed images, pixels.
     observation_height: int = 240
     # Width of observed images, pixels.
     observation_width: int = 320
     # Width of rendered frames, pixels.
     visualization_width: int = 640
+
+    @property
+    def choices(self) -> dict[str, Iterable[str]]:
+        """Possible values of the options that have a few."""
+        return {**super().choices, "cameras": CAMERAS}
 
     @property
     def observed_cameras(self) -> tuple[str, ...]:

@@ -2,8 +2,8 @@
 
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
-from typing import Any, ClassVar, Literal, get_args, get_origin
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import gymnasium as gym
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
@@ -26,10 +26,6 @@ OBSERVED_KEYS: dict[str, tuple[str, ...]] = {
     "pixels_environment_state_agent_pos": (AGENT_POS, ENVIRONMENT_STATE, PIXELS),
 }
 """Raw keys of every `--env.obs_type`; each environment type has some of them."""
-
-# Named, since the flag parser finds no comment of a field with quotes in its annotation.
-ObsType = Literal["state", "pixels_agent_pos", "pixels"]
-RenderMode = Literal["rgb_array"]
 
 DESCRIPTIONS = {
     "gym_pusht/PushT-v0": "Push the T-shaped block onto the T-shaped target.",
@@ -89,27 +85,22 @@ def require_choice(option: str, value: str | list[str] | None, choices: Iterable
     )
 
 
-def choices_of(annotation: Any) -> tuple[str, ...]:
-    """Values of the Literal in an annotation such as `list[Literal["a", "b"]] | None`; none without a Literal."""
-    if get_origin(annotation) is Literal:
-        return get_args(annotation)
-    return tuple(choice for part in get_args(annotation) for choice in choices_of(part))
-
-
 @dataclass
 class SimulatedEnvConfig(EnvConfig):
     """Options of every environment type here.
 
-    A type names its `tasks`, the choices of `task` and `obs_type` (and perhaps cameras), and builds an environment.
+    A type names its `tasks` and `obs_types` (and perhaps more choices), and builds an environment. Choices are no Literal
+    types: argparse would hold the flags of every other environment type to them, since all have the same names.
     """
 
     tasks: ClassVar[Mapping[str, TaskSpec]]
+    obs_types: ClassVar[tuple[str, ...]] = ("state", "pixels_agent_pos", "pixels")
 
     # Control steps per second; default: the task's, the only possible value.
     fps: int | None = None
     # Steps after which an episode is truncated; default: the task's own limit.
     episode_length: int | None = None
-    # What is observed.
+    # What is observed: state, pixels_agent_pos or pixels.
     obs_type: str = "state"
     # Height of observed images, pixels.
     observation_height: int = 96
@@ -121,8 +112,8 @@ class SimulatedEnvConfig(EnvConfig):
     visualization_width: int = 480
     # Draw shadows; without a GPU an image is several times faster without.
     shadows: bool = True
-    # gymnasium's render mode; nothing is rendered before `render` is called.
-    render_mode: RenderMode = "rgb_array"
+    # gymnasium's render mode, rgb_array; nothing is rendered before `render` is called.
+    render_mode: str = "rgb_array"
     # Derived from the task.
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     # Raw key to LeRobot key, derived from the task.
@@ -134,10 +125,8 @@ class SimulatedEnvConfig(EnvConfig):
         Raises:
             FlagError: naming the option that is impossible.
         """
-        for option in fields(self):
-            value, choices = getattr(self, option.name), choices_of(option.type)
-            if choices and (value is not None or option.default is not None):
-                require_choice(option.name, value, choices)
+        for option, choices in self.choices.items():
+            require_choice(option, getattr(self, option), choices)
         self.fps = self.spec.fps if self.fps is None else self.fps
         require(
             self.fps == self.spec.fps,
@@ -173,6 +162,11 @@ class SimulatedEnvConfig(EnvConfig):
             ENVIRONMENT_STATE: OBS_ENV_STATE,
             **images,
         }
+
+    @property
+    def choices(self) -> dict[str, Iterable[str]]:
+        """Possible values of the options that have a few."""
+        return {"task": self.tasks, "obs_type": self.obs_types, "render_mode": ("rgb_array",)}
 
     @property
     def spec(self) -> TaskSpec:

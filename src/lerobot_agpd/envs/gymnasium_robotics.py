@@ -10,27 +10,14 @@ The tasks are in `robotics_tasks`, the wrapper in `robotics_wrapper`.
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 import gymnasium as gym
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_agpd.config import require
-from lerobot_agpd.envs.base import ObsType, SimulatedEnvConfig
+from lerobot_agpd.envs.base import SimulatedEnvConfig, require_choice
 from lerobot_agpd.envs.packages import require_packages
-from lerobot_agpd.envs.robotics_tasks import KITCHEN, KITCHEN_DEFAULT, TASKS, KitchenTask
-
-Task = Literal[
-    "FetchReach-v4",
-    "FetchPush-v4",
-    "FetchPickAndPlace-v4",
-    "FetchSlide-v4",
-    "AdroitHandDoor-v1",
-    "AdroitHandHammer-v1",
-    "AdroitHandPen-v1",
-    "AdroitHandRelocate-v1",
-    "FrankaKitchen-v1",
-]
+from lerobot_agpd.envs.robotics_tasks import KITCHEN, KITCHEN_DEFAULT, KITCHEN_TASKS, TASKS
 
 
 @EnvConfig.register_subclass("gymnasium_robotics")
@@ -40,12 +27,10 @@ class GymnasiumRoboticsEnv(SimulatedEnvConfig):
 
     tasks = TASKS
 
-    # Task of Gymnasium-Robotics.
-    task: Task | None = "FetchPickAndPlace-v4"
-    # What is observed.
-    obs_type: ObsType = "state"
+    # Task of Gymnasium-Robotics, e.g. FetchReach-v4, AdroitHandDoor-v1 or FrankaKitchen-v1.
+    task: str | None = "FetchPickAndPlace-v4"
     # FrankaKitchen-v1 only: the tasks that make a success, e.g. "[kettle]"; default: D4RL's kitchen-complete.
-    tasks_to_complete: list[KitchenTask] | None = None
+    tasks_to_complete: list[str] | None = None
 
     def __post_init__(self) -> None:
         """Check the options, fill in what depends on the task and derive the features.
@@ -58,6 +43,8 @@ class GymnasiumRoboticsEnv(SimulatedEnvConfig):
             self.task == KITCHEN or self.tasks_to_complete is None,
             f"--env.tasks_to_complete={self.tasks_to_complete} belongs to {KITCHEN}, not to {self.task}",
         )
+        if self.tasks_to_complete is not None:
+            require_choice("tasks_to_complete", self.tasks_to_complete, KITCHEN_TASKS)
 
     def make_single(self) -> gym.Env:
         """Build one wrapped environment; see `SimulatedEnvConfig.make_single`."""

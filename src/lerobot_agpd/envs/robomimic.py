@@ -5,16 +5,13 @@ are in `robomimic_tasks`, the simulation in `robosuite_sim`.
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 import gymnasium as gym
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_agpd.envs.base import ObsType, SimulatedEnvConfig, require_choice
+from lerobot_agpd.envs.base import SimulatedEnvConfig, require_choice
 from lerobot_agpd.envs.packages import require_packages
 from lerobot_agpd.envs.robomimic_tasks import TASKS
-
-Task = Literal["lift", "can", "square", "transport", "tool_hang"]
 
 
 @EnvConfig.register_subclass("robosuite_robomimic")
@@ -24,10 +21,8 @@ class RobomimicEnvConfig(SimulatedEnvConfig):
 
     tasks = TASKS
 
-    # Task of robomimic.
-    task: Task | None = "lift"
-    # What is observed.
-    obs_type: ObsType = "state"
+    # Task of robomimic: lift, can, square, transport or tool_hang.
+    task: str | None = "lift"
     # Cameras to observe, e.g. "[agentview]"; default: those of robomimic's image datasets.
     cameras: list[str] | None = None
     # Height of observed images, pixels; robomimic has 240 for tool_hang.

@@ -6,7 +6,7 @@ and what success means) and in `gymnasium_robotics.Task`.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -98,7 +98,7 @@ _ARM = (range(10), ())
 _ARM_AND_OBJECT = ((0, 1, 2, 9, 10, 20, 21, 22, 23, 24), (*range(3, 9), *range(11, 20)))
 
 KITCHEN = "FrankaKitchen-v1"
-KitchenTask = Literal[
+KITCHEN_TASKS = (
     "bottom burner",
     "top burner",
     "light switch",
@@ -106,8 +106,8 @@ KitchenTask = Literal[
     "hinge cabinet",
     "microwave",
     "kettle",
-]
-KITCHEN_DEFAULT: tuple[KitchenTask, ...] = ("microwave", "kettle", "light switch", "slide cabinet")
+)
+KITCHEN_DEFAULT = ("microwave", "kettle", "light switch", "slide cabinet")
 """The four of D4RL's `kitchen-complete` (arXiv:2004.07219)."""
 
 TASKS: dict[str, RoboticsTask] = {

@@ -123,11 +123,11 @@ class Matrix:
 
     tasks: dict[str, TaskEntry]
     methods: dict[str, MethodEntry]
-    # training seeds
+    # Training seeds.
     seeds: list[int]
-    # folder of the runs and the report
+    # Folder of the runs and the report.
     output: Path
-    # flags of lerobot-train for all runs
+    # Flags of lerobot-train for all runs.
     common: dict[str, Any] = field(default_factory=dict)
     evaluation: EvaluationEntry = field(default_factory=EvaluationEntry)
     # Methods that all are compared with; default: all.

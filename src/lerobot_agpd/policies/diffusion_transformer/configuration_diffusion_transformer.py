@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
@@ -14,9 +13,8 @@ from lerobot_agpd.config import require
 UNUSED_DOWN_DIMS = (16,)
 """Size of the U-Net that LeRobot's DiffusionModel always builds, where another denoiser replaces it."""
 
-# Named, not spelled out at the fields: the flag parser finds a field's comment only if its annotation is plain words.
-PredictionType = Literal["sample", "epsilon"]
-Denoiser = Literal["mlp", "transformer", "unet"]
+DENOISERS = ("mlp", "transformer", "unet")
+"""No Literal type: argparse would hold the flags of the same name of all other policy types to it."""
 
 
 @dataclass
@@ -100,9 +98,9 @@ class DiffusionTransformerConfig(DiffusionConfig):
         }
     )
     # What the denoiser predicts: the clean chunk (sample), or the noise (epsilon).
-    prediction_type: PredictionType = "sample"
-    # Network that denoises.
-    denoiser: Denoiser = "mlp"
+    prediction_type: str = "sample"
+    # Network that denoises: mlp, transformer or unet.
+    denoiser: str = "mlp"
     mlp: MLPDenoiserConfig = field(default_factory=MLPDenoiserConfig)
     transformer: TransformerDenoiserConfig = field(default_factory=TransformerDenoiserConfig)
     # Average the weights (EMA, as in arXiv:2303.04137) and save the average as the policy's weights.
@@ -118,6 +116,10 @@ class DiffusionTransformerConfig(DiffusionConfig):
     optimizer_betas: tuple[float, float] = (0.9, 0.999)
 
     def __post_init__(self) -> None:
+        require(
+            self.denoiser in DENOISERS,
+            f"--policy.denoiser must be one of {', '.join(DENOISERS)}, got '{self.denoiser}'",
+        )
         if not self.down_dims:
             self.down_dims = DiffusionConfig.down_dims if self.denoiser == "unet" else UNUSED_DOWN_DIMS
         super().__post_init__()
