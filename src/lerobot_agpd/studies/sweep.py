@@ -72,7 +72,7 @@ class SweepRow:
 def configured(student_config: StudentConfig, setting: Setting) -> StudentConfig:
     """The student's configuration with one setting's strategy."""
     config = deepcopy(student_config)
-    if setting.strategy in ("teacher", "guided"):
+    if setting.strategy == "teacher" or setting.strategy == "guided":
         config.collect.strategy = setting.strategy
     else:
         config.collect.strategy, config.collect.mixing.form = "mixing", setting.strategy

@@ -168,8 +168,9 @@ def test_collection_rounds_are_pooled_and_averaged(compared):
 
 
 def test_rounds_one_by_one():
-    solved = {"strategy": tally(8, 2, 2, 3), "teacher_only": tally(1, 0, 0, 1), "mean_guidance_shift": None}
-    rounds = as_reports(collected((6, 6, 5), (4, 2, 2)), collected((8, 2, 2), (1, 0, 0), round=1, **solved))
+    second = collected((8, 2, 2), (1, 0, 0), round=1, mean_guidance_shift=None)
+    second |= {"strategy": tally(8, 2, 2, 3), "teacher_only": tally(1, 0, 0, 1)}
+    rounds = as_reports(collected((6, 6, 5), (4, 2, 2)), second)
     _, first, second = rounds_table(rounds)
     assert first == ("0", "0.5", "6 / 6", "2 / 4", "10", "7", "0.50", "3")
     assert second == ("1", "0.5", "2 / 5", "-", "9", "2", "-", "3")
