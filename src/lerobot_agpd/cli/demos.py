@@ -32,7 +32,7 @@ MAX_ATTEMPTS_PER_EPISODE = 10
 REPORT_PATH = Path("meta/demos.json")
 
 
-@dataclass
+@dataclass(kw_only=True)
 class DemosConfig(NewDataset):
     """Options of `lerobot-agpd-demos`."""
 

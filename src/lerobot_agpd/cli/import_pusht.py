@@ -21,7 +21,7 @@ SUCCESS_COVERAGE = 0.95
 Variant = Literal["keypoints", "state", "image"]
 
 
-@dataclass
+@dataclass(kw_only=True)
 class ImportPushTConfig(NewDataset):
     """Options of `lerobot-agpd-import-pusht`."""
 

@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 REPORT_PATH = Path("meta/robomimic.json")
 
 
-@dataclass
+@dataclass(kw_only=True)
 class ImportRobomimicConfig(NewDataset):
     """Options of `lerobot-agpd-import-robomimic`; `--source=` may be left out before the first word."""
 
