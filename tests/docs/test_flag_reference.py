@@ -83,7 +83,7 @@ def test_help_shows_each_flag_its_own_text(name):
 
 def test_choices_are_listed():
     actions = options(CLASSES["agpd"])
-    assert set(actions["--collect.strategy"].choices) == {"guided", "teacher", "mixing", "rollin"}
+    assert set(actions["--collect.strategy"].choices) == {"guided", "nearest", "teacher", "mixing", "rollin"}
     assert set(actions["--guidance.at"].choices) == {"x0", "mu"}
 
 

@@ -1,7 +1,5 @@
 """The environment type `aloha_state` against gym_aloha."""
 
-from typing import get_args
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -9,7 +7,7 @@ from lerobot.envs import preprocess_observation
 from lerobot.envs.utils import env_to_policy_features
 from lerobot.utils.constants import ACTION
 
-from lerobot_agpd.envs.aloha import AlohaStateEnvConfig, Camera
+from lerobot_agpd.envs.aloha import CAMERAS, AlohaStateEnvConfig
 from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS
 
 gym_aloha = pytest.importorskip("gym_aloha")
@@ -102,4 +100,4 @@ def test_the_state_is_at_hand_whatever_is_observed(rendering, obs_type):
 
 def test_the_cameras_are_the_models():
     model = AlohaStateEnvConfig().make_single().unwrapped._env.physics.model
-    assert set(get_args(Camera)) == {model.id2name(camera, "camera") for camera in range(model.ncam)}
+    assert set(CAMERAS) == {model.id2name(camera, "camera") for camera in range(model.ncam)}

@@ -4,12 +4,10 @@ import pickle
 import sys
 import warnings
 from dataclasses import dataclass
-from typing import get_args
 
 import draccus
 import numpy as np
 import pytest
-from draccus.utils import DecodingError
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from lerobot.envs import EnvConfig, make_env, preprocess_observation
@@ -115,11 +113,6 @@ def test_vector_env_agrees_with_the_declared_features(use_async_envs, kind, task
         env.close()
 
 
-@every_type
-def test_choices_are_those_of_the_tables(kind):
-    assert get_args(MODULES[kind][0].Task) == tuple(kind.tasks)
-
-
 @pytest.mark.parametrize(
     ("kind", "options", "expected"),
     [
@@ -201,16 +194,14 @@ def test_what_one_type_cannot_do_is_refused(kind, options, message):
 @every_type
 def test_choices_are_checked_wherever_they_come_from(kind, capsys):
     name = EnvConfig.get_choice_name(kind)
-    with pytest.raises(SystemExit):
+    with pytest.raises(FlagError, match="--env.obs_type=smell.*pixels_agent_pos"):
         draccus.parse(Command, args=[f"--env.type={name}", "--env.obs_type=smell"])
-    error = capsys.readouterr().err
-    assert all(word in error for word in ("--env.obs_type", "smell", "pixels_agent_pos"))
-    with pytest.raises(DecodingError, match="smell.*pixels_agent_pos"):
+    with pytest.raises(FlagError, match="smell.*pixels_agent_pos"):
         draccus.decode(EnvConfig, {"type": name, "obs_type": "smell"})
     with pytest.raises(SystemExit):
         draccus.parse(Command, args=[f"--env.type={name}", "--help"])
     text = capsys.readouterr().out
-    assert "--env.obs_type {" in text and "What is observed" in text
+    assert "What is observed: " in text
 
 
 @every_type

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot.configs import PreTrainedConfig
-from lerobot.policies import PreTrainedPolicy
+from lerobot.policies import PreTrainedPolicy, make_pre_post_processors
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
@@ -14,6 +14,7 @@ from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 from lerobot.utils.random_utils import seeded_context
 
 from lerobot_agpd.cli.command import entry_point
+from lerobot_agpd.config import require
 from lerobot_agpd.loading import load_policy, read_policy_config
 from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
@@ -35,10 +36,15 @@ class ExportConfig:
     checkpoint: str
     # Folder of the plain checkpoint; must not exist.
     output: Path
+    # Hub repository to upload to.
+    repo_id: str | None = None
+    # Upload the result.
+    push_to_hub: bool = False
 
     def __post_init__(self) -> None:
         if self.output.exists():
             raise FileExistsError(f"--output={self.output} already exists; choose a new folder")
+        require(not self.push_to_hub or bool(self.repo_id), "--push_to_hub=true needs --repo_id")
 
 
 def as_plain(policy: PreTrainedPolicy) -> PreTrainedPolicy:
@@ -87,7 +93,7 @@ def largest_difference(policy: PreTrainedPolicy, plain: PreTrainedPolicy, batch_
     return float((chunks[0] - chunks[1]).abs().max())
 
 
-def export(config: ExportConfig) -> None:
+def export(config: ExportConfig) -> PreTrainedPolicy:
     """Write the plain checkpoint with its processors.
 
     Raises:
@@ -109,12 +115,17 @@ def export(config: ExportConfig) -> None:
     logger.info(
         "%s checkpoint in %s; largest difference of actions %.1e", plain.name, config.output, difference
     )
+    return plain
 
 
 @entry_point("lerobot-agpd-export")
 def main(config: ExportConfig) -> None:
-    """Export."""
-    export(config)
+    """Export and optionally upload."""
+    plain = export(config)
+    if config.push_to_hub:
+        plain.push_to_hub(str(config.repo_id))
+        for processor in make_pre_post_processors(plain.config, pretrained_path=str(config.output)):
+            processor.push_to_hub(str(config.repo_id))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,8 @@
 """`lerobot-agpd-viz`: watch a teacher being guided toward a student, as a rerun recording."""
 
 import logging
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,6 +48,8 @@ class VizConfig(StudentFlags):
     png: Path | None = None
     # Record rendered frames.
     render: bool = True
+    # Show the finished recording in a rerun viewer.
+    open: bool = False
 
     def __post_init__(self) -> None:
         """Read the checkpoint's configuration and check the options.
@@ -85,6 +89,9 @@ def guidance_scale(config: VizConfig) -> float:
         return student_config.guidance.scale
     beside = student_config.pretrained_path.resolve().parents[2] / REPLAY_FOLDER
     reports = read_reports(Path(student_config.replay.root or beside))[: progress.rounds]
+    if len(reports) < progress.rounds:
+        logger.warning("the collected rounds of the checkpoint's run were not found")
+        return student_config.guidance.scale
     return reports[-1].next_scale if reports else student_config.guidance.scale
 
 
@@ -168,6 +175,8 @@ def main(config: VizConfig) -> None:
     logger.info("recording in %s (open it with `rerun %s`)", config.output, config.output)
     if config.png is not None:
         logger.info("still picture in %s", config.png)
+    if config.open:  # in a process of its own, which outlives this one
+        subprocess.Popen([sys.executable, "-m", "rerun", str(config.output)], start_new_session=True)
 
 
 if __name__ == "__main__":

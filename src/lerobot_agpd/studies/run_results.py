@@ -13,7 +13,6 @@ from lerobot.configs.train import TRAIN_CONFIG_NAME
 
 from lerobot_agpd.config import require
 from lerobot_agpd.files import read_json, write_json
-from lerobot_agpd.progress import REPLAY_FOLDER
 from lerobot_agpd.rollout.report import RoundReport, read_reports
 from lerobot_agpd.studies.evaluation import Evaluation, Evaluator, best_step, checkpoint_steps
 from lerobot_agpd.studies.latency import Latency
@@ -22,7 +21,7 @@ from lerobot_agpd.studies.parsing import decode_environment
 from lerobot_agpd.studies.provenance import digest, provenance
 from lerobot_agpd.studies.results import CHECKPOINTS, RunResult
 from lerobot_agpd.studies.runs import Run, expand
-from lerobot_agpd.studies.training import is_trained, read_starts, train_command
+from lerobot_agpd.studies.training import is_trained, read_starts, replay_folder, train_command
 
 logger = logging.getLogger(__name__)
 
@@ -38,7 +37,7 @@ def evaluate_run(matrix: Matrix, run: Run) -> None:
     env_config, settings = decode_environment(matrix.tasks[run.task].env), matrix.evaluation
     with closing(Evaluator(env_config, settings.batch_size, run.folder, settings.device)) as evaluator:
         measured = (_evaluate_policy if run.policy else _evaluate_training)(matrix, run, evaluator)
-    rounds = read_reports(run.output_dir / REPLAY_FOLDER)
+    rounds = read_reports(replay_folder(run))
     content = {
         "task": run.task,
         "method": run.method,

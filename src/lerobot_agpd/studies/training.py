@@ -2,7 +2,8 @@
 
 <output>/<task>/<method>/seed-<n>/
     starts.jsonl       every start: flags, when, from which step, how long, with which packages, teacher and demonstrations
-    train/             output folder of lerobot-train, with the collected episodes in train/agpd
+    train/             output folder of lerobot-train
+    agpd/              collected episodes, once a run without checkpoint had to start anew; else train/agpd
     train.log  evaluate.log
     evaluations/       one file per evaluation of a checkpoint
     run.json           the result
@@ -63,12 +64,20 @@ def is_trained(run: Run) -> bool:
     return last_step(run) >= int(config["steps"])
 
 
+def replay_folder(run: Run) -> Path:
+    """The folder of the run's collected episodes."""
+    own = run.folder / REPLAY_FOLDER
+    return own if own.is_dir() else run.output_dir / REPLAY_FOLDER
+
+
 def train_command(run: Run) -> list[str]:
     """The command that starts or resumes a run, as a user would type it."""
     args = run.args
     if last_checkpoint(run) is not None:
         checkpoint = run.output_dir / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK
         args = [f"--config_path={checkpoint / PRETRAINED_MODEL_DIR / TRAIN_CONFIG_NAME}", "--resume=true"]
+    if (run.folder / REPLAY_FOLDER).is_dir():
+        args = [*args, f"--policy.replay.root={run.folder / REPLAY_FOLDER}"]
     return ["lerobot-train", *args, f"--output_dir={run.output_dir}"]
 
 
@@ -101,9 +110,12 @@ def check_same_command(run: Run) -> None:
 
 
 def prepare(run: Run) -> None:
-    """Make a run's folder ready: a training that never reached a checkpoint starts anew."""
+    """Make a run's folder ready: a training that never reached a checkpoint starts anew, keeping its episodes."""
     run.folder.mkdir(parents=True, exist_ok=True)
     if last_checkpoint(run) is None and run.output_dir.exists():
+        episodes = run.output_dir / REPLAY_FOLDER
+        if any(episodes.glob("round-*")):
+            episodes.rename(run.folder / REPLAY_FOLDER)
         shutil.rmtree(run.output_dir)
 
 
@@ -139,7 +151,7 @@ def _write_starts(run: Run, starts: Sequence[Start]) -> None:
 
 def _rounds_adopted(run: Run) -> int:
     """Rounds that were finished after the last checkpoint: the resumed student meets them earlier."""
-    finished = len(read_reports(run.output_dir / REPLAY_FOLDER))
+    finished = len(read_reports(replay_folder(run)))
     checkpoint = last_checkpoint(run)
     state = checkpoint / PRETRAINED_MODEL_DIR / STATE_FILE if checkpoint else None
     return finished - (read_json(state)["rounds"] if state and state.is_file() else 0)

@@ -120,6 +120,10 @@ class DiffusionTransformerConfig(DiffusionConfig):
             self.denoiser in DENOISERS,
             f"--policy.denoiser must be one of {', '.join(DENOISERS)}, got '{self.denoiser}'",
         )
+        require(
+            self.prediction_type in ("sample", "epsilon"),
+            f"--policy.prediction_type must be sample or epsilon, got '{self.prediction_type}'",
+        )
         if not self.down_dims:
             self.down_dims = DiffusionConfig.down_dims if self.denoiser == "unet" else UNUSED_DOWN_DIMS
         super().__post_init__()
