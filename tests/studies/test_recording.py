@@ -117,7 +117,7 @@ def test_neither_frames_nor_overlay_nor_success(tmp_path):
 @pytest.mark.parametrize(("action_dim", "frames"), [(2, True), (1, True), (5, False)])
 def test_still_is_drawn(tmp_path, action_dim, frames):
     path = tmp_path / "still.png"
-    draw_still(make_rollout(action_dim, frames), path)
+    draw_still(make_rollout(action_dim, frames, overlay=action_dim == 2), path)
     assert path.read_bytes().startswith(b"\x89PNG")
 
 

@@ -146,6 +146,7 @@ def changed_defaults(matrix: str, run, config):
             yield name, (then[name], now[name])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "path", sorted((ROOT / "benchmarks" / "comparison").glob("*.yaml")), ids=lambda p: p.stem
 )
