@@ -112,7 +112,7 @@ def matching_normalizer(
         errors[name] = {
             key: _relative_error(normalizer.normalize(key, raw[key]), delivered[key]) for key in raw
         }
-        if max(errors[name].values()) <= tolerance:
+        if all(error <= tolerance for error in errors[name].values()):  # which no NaN is
             logger.info("gathered frames are normalized with the %s statistics", name)
             return normalizer
     raise ValueError(
