@@ -107,6 +107,7 @@ def test_failed_starts_by_hand():
     second = [record(2), record(3, success=True), record(5)]
     assert failed_starts([*first, *second, record(6)]) == [5, 6, 2]
     assert failed_starts([]) == []
+    assert failed_starts([record(1, invalid="'action' at step 0")]) == [], "the environment failed there"
 
 
 def test_retries_take_the_first_places_of_the_strategy():

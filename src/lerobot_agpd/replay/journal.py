@@ -112,7 +112,7 @@ class EpisodeJournal:
 
     def append(self, round_number: int, rank: int, episode: Episode, record: EpisodeRecord) -> None:
         """Write an episode of a round: its frames if it is kept, then its record."""
-        folder = self._folder(round_number)
+        folder = self.folder(round_number)
         folder.mkdir(parents=True, exist_ok=True)
         vectors, images = split_columns(episode.columns)
         if record.kept:
@@ -125,7 +125,7 @@ class EpisodeJournal:
 
     def finish(self, round_number: int, report: Mapping[str, Any]) -> None:
         """Make a round a finished one; called by one process after all have written their episodes."""
-        folder = self._folder(round_number)
+        folder = self.folder(round_number)
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / REPORT, report, indent=2)
 
@@ -146,7 +146,7 @@ class EpisodeJournal:
         Raises:
             ValueError: if an index is damaged.
         """
-        folder = self._folder(round_number)
+        folder = self.folder(round_number)
         return [
             StoredEpisode(
                 record=_record(entry),
@@ -170,15 +170,15 @@ class EpisodeJournal:
         Raises:
             ValueError: if a round before the last finished one is not finished, or a report is damaged.
         """
-        finished = [number for number in self._rounds() if (self._folder(number) / REPORT).exists()]
+        finished = [number for number in self._rounds() if (self.folder(number) / REPORT).exists()]
         missing = set(range(len(finished))) - set(finished)
         if missing:
             raise ValueError(
-                f"{self._folder(min(missing))} should hold a finished round with a {REPORT}, since a later round is "
+                f"{self.folder(min(missing))} should hold a finished round with a {REPORT}, since a later round is "
                 "finished; restore it, or start a new run with another --policy.replay.root"
             )
         remedy = "restore it, or delete it to have the round finished again if no later round exists"
-        return [read_json(self._folder(number) / REPORT, remedy) for number in finished]
+        return [read_json(self.folder(number) / REPORT, remedy) for number in finished]
 
     def _rounds(self) -> list[int]:
         """Numbers of the rounds that were begun, in order."""
@@ -187,12 +187,13 @@ class EpisodeJournal:
         names = (re.fullmatch(r"round-(\d{5,})", path.name) for path in self.root.iterdir())
         return sorted(int(name[1]) for name in names if name)
 
-    def _folder(self, round_number: int) -> Path:
+    def folder(self, round_number: int) -> Path:
+        """Folder of a round, whether it exists or not."""
         return self.root / f"round-{round_number:05d}"
 
     def _entries(self, round_number: int) -> list[tuple[int, dict[str, Any]]]:
         """Lines of a round's indices with their ranks, ordered by rank and number."""
-        folder = self._folder(round_number)
+        folder = self.folder(round_number)
         if not folder.exists():
             return []
         names = (re.fullmatch(r"rank-(\d+)\.jsonl", path.name) for path in folder.iterdir())
