@@ -77,14 +77,14 @@ def require_statistics(
         f"--dataset.repo_id={repo_id} has no statistics of {missing} (meta/stats.json), and the policy would train on "
         f"values that are not normalized; {remedy}",
     )
-    bad = _not_finite_statistic({key: entry for key, entry in (stats or {}).items() if key in features})
+    bad = not_finite_statistic({key: entry for key, entry in (stats or {}).items() if key in features})
     require(
         bad is None,
         f"--dataset.repo_id={repo_id}: the statistic {bad} (meta/stats.json) is not finite; {remedy}",
     )
 
 
-def _not_finite_statistic(stats: Mapping[str, Mapping[str, Any]]) -> str | None:
+def not_finite_statistic(stats: Mapping[str, Mapping[str, Any]]) -> str | None:
     """The first statistic with a value that is not finite, as "'name' of 'feature'"."""
     for key, entry in stats.items():
         for name, value in entry.items():
