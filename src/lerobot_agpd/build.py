@@ -123,7 +123,7 @@ def build_parts(
 
 def _teacher(config: StudentConfig) -> Teacher | None:
     """The teacher of `--policy.teacher.path`, if any part of the method uses one."""
-    if not (config.collect.enabled or config.needs_teacher_chunks):
+    if not config.uses_teacher:
         return None
     teacher = load_teacher(config.teacher, config.device or "cpu")
     if config.collect.enabled and config.needs_guidance:

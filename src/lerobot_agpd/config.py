@@ -261,6 +261,11 @@ class StudentConfig(PreTrainedConfig):
         return self.future_steps
 
     @property
+    def uses_teacher(self) -> bool:
+        """Whether any part of the method uses a teacher."""
+        return self.collect.enabled or self.needs_teacher_chunks
+
+    @property
     def needs_guidance(self) -> bool:
         """Whether the teacher must be one that can be guided; roll-in with a scale of 0 leaves it alone."""
         strategy = self.collect.strategy

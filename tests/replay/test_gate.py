@@ -9,10 +9,10 @@ import torch
 from lerobot_agpd.config import FlagError
 from lerobot_agpd.replay.frames import FrameTable
 from lerobot_agpd.replay.gate import (
+    FarValues,
     first_not_finite,
     require_finite_frames,
     require_statistics,
-    warn_of_far_values,
 )
 
 STATE, ENV_STATE = "observation.state", "observation.environment_state"
@@ -64,11 +64,13 @@ def test_the_first_value_of_an_episode_that_is_not_finite():
 
 def test_values_that_are_far_off_are_warned_of(caplog):
     caplog.set_level(logging.WARNING)
-    warn_of_far_values("round 1", "action", torch.full((4, 3, 2), 49.0))
-    warn_of_far_values("round 1", "action", torch.zeros(0, 2))
+    far = FarValues()
+    far.check("round 1", "action", torch.full((4, 3, 2), 49.0))
+    far.check("round 1", "action", torch.zeros(0, 2))
     assert not caplog.records
     values = torch.zeros(4, 3, 2)
     values[2, 1, 1] = -2000
-    warn_of_far_values("round 1", "action", values)
+    for _ in range(2):
+        far.check("round 1", "action", values)
     (record,) = caplog.records
     assert "round 1: dimension 1 of 'action'" in record.getMessage() and "2000" in record.getMessage()

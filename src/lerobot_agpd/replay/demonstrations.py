@@ -17,9 +17,9 @@ from lerobot_agpd.replay.gate import require_finite_frames, require_statistics
 from lerobot_agpd.replay.normalization import (
     Normalizer,
     Statistics,
-    floor_statistics,
     matching_normalizer,
     saved_statistics,
+    training_statistics,
 )
 
 Batch = dict[str, Any]
@@ -83,6 +83,11 @@ class DemonstrationFrames:
         self._normalizer: Normalizer | None = None
 
     @property
+    def knows_normalizer(self) -> bool:
+        """Whether a batch was seen."""
+        return self._normalizer is not None
+
+    @property
     def normalizer(self) -> Normalizer:
         """The normalizer of the running training loop.
 
@@ -143,5 +148,6 @@ class DemonstrationFrames:
             if saved:
                 candidates.append(("checkpoint's", saved))
         if self._stats:
-            candidates += [("dataset's floored", floor_statistics(self._stats)), ("dataset's", self._stats)]
+            floored = training_statistics(self.config, self._stats)
+            candidates += [("dataset's floored", floored), ("dataset's", self._stats)]
         return [*candidates, ("absent", {})]  # a loop without normalization

@@ -18,7 +18,7 @@ from lerobot_agpd.replay.frames import FrameTable
 logger = logging.getLogger(__name__)
 
 FAR = 50.0
-"""Normalized values beyond this are warned of: one of them outweighs a whole batch of ordinary ones."""
+"""Normalized values beyond this are warned of: one of them outweighs a batch of ordinary ones."""
 
 
 # ---- demonstrations ----
@@ -110,25 +110,26 @@ def first_not_finite(columns: Mapping[str, Array]) -> str | None:
     return f"'{key}' at step {found[key]}"
 
 
-def warn_of_far_values(source: str, key: str, values: Tensor) -> None:
-    """Warn of values (..., D) that lie far outside what the student's normalization expects.
+class FarValues:
+    """Warns, once per feature, of values far outside what the student's normalization expects."""
 
-    Args:
-        source: what holds them, for the message.
-        key: their feature.
-        values: normalized by the student's statistics.
-    """
-    if not values.numel():
-        return
-    farthest = values.detach().abs().flatten(0, -2).amax(dim=0)  # (D,)
-    dimension = int(farthest.argmax())
-    if farthest[dimension] > FAR:
-        logger.warning(
-            "%s: dimension %d of '%s' lies up to %.0f of the student's normalized units (standard deviations) from "
-            "what the demonstrations hold; the student will imitate little else. Do the demonstrations lack this "
-            "motion, or has it other units?",
-            source,
-            dimension,
-            key,
-            farthest[dimension],
-        )
+    def __init__(self) -> None:
+        self._warned: set[str] = set()
+
+    def check(self, source: str, key: str, values: Tensor) -> None:
+        """Look at values (..., D) of a feature, normalized by the student's statistics; `source` holds them."""
+        if key in self._warned or not values.numel():
+            return
+        farthest = values.detach().abs().flatten(0, -2).amax(dim=0)  # (D,)
+        dimension = int(farthest.argmax())
+        if farthest[dimension] > FAR:
+            self._warned.add(key)
+            logger.warning(
+                "%s: dimension %d of '%s' lies up to %.0f normalized units (standard deviations) from what the "
+                "demonstrations hold, and such values drown all others in training; do the demonstrations lack this "
+                "motion, or are its units others?",
+                source,
+                dimension,
+                key,
+                farthest[dimension],
+            )
