@@ -76,7 +76,8 @@ class EpisodeJournal:
         Args:
             demonstrations: metadata of the demonstrations, whose features a merged dataset takes over.
             identity: what the run's episodes depend on, such as the teacher and the environment.
-            resume: whether the run continues a checkpoint, whose episodes are its own whatever has changed.
+            resume: whether the run continues a checkpoint, whose episodes are its own whatever has changed; changes
+                are warned of.
 
         Raises:
             ValueError: if the folder holds episodes of another run.
@@ -92,17 +93,22 @@ class EpisodeJournal:
             }
             self.root.mkdir(parents=True, exist_ok=True)
             write_json(self.root / HEADER, content, indent=2)
-        if not resume:
-            self._check_identity(json.loads(json.dumps(dict(identity), default=str)))
+        self._check_identity(json.loads(json.dumps(dict(identity), default=str)), resume)
 
-    def _check_identity(self, identity: Mapping[str, Any]) -> None:
+    def _check_identity(self, identity: Mapping[str, Any], resume: bool) -> None:
         recorded = self.header["identity"]
         differing = [
             f"{key} {recorded.get(key)!r} instead of {identity.get(key)!r}"
             for key in sorted({*recorded, *identity})
             if recorded.get(key) != identity.get(key)
         ]
-        if differing:
+        if differing and resume:
+            logger.warning(
+                "the episodes in %s were collected with other settings (%s); the next ones follow the new settings",
+                self.root,
+                "; ".join(differing),
+            )
+        elif differing:
             raise ValueError(
                 f"{self.root} holds the episodes of another run ({'; '.join(differing)}); pass another "
                 "--policy.replay.root, or continue that run with --resume=true"
