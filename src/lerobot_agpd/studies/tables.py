@@ -229,5 +229,5 @@ def rounds_table(rounds: Sequence[RoundReport]) -> list[Row]:
 
 
 def _successes(tally: Tally) -> str:
-    counted = tally.generated - tally.solved_at_start
+    counted = tally.generated - tally.solved_at_start - tally.invalid
     return f"{tally.successful} / {counted}" if counted else "-"

@@ -8,7 +8,7 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 
-from lerobot_agpd.config import require
+from lerobot_agpd.config import require, require_at_least, require_scheduler
 
 UNUSED_DOWN_DIMS = (16,)
 """Size of the U-Net that LeRobot's DiffusionModel always builds, where another denoiser replaces it."""
@@ -61,6 +61,17 @@ class TransformerDenoiserConfig:
             "--policy.transformer.width must be even, at least 4 (it holds pairs of sines and cosines) and a "
             f"multiple of n_heads={self.n_heads}, got {self.width}",
         )
+
+
+COUNTS = (
+    "n_obs_steps",
+    "horizon",
+    "n_action_steps",
+    "num_train_timesteps",
+    "num_inference_steps",
+    "noise_samples_per_frame",
+)
+"""Settings that are numbers of steps or samples."""
 
 
 @PreTrainedConfig.register_subclass("diffusion_transformer")
@@ -126,11 +137,10 @@ class DiffusionTransformerConfig(DiffusionConfig):
         )
         if not self.down_dims:
             self.down_dims = DiffusionConfig.down_dims if self.denoiser == "unet" else UNUSED_DOWN_DIMS
+        require_at_least(self, 1, *COUNTS)
+        require_at_least(self, 0, "drop_n_last_frames", "scheduler_warmup_steps")
+        require_scheduler(self.scheduler_name)
         super().__post_init__()
-        require(
-            self.noise_samples_per_frame >= 1,
-            f"--policy.noise_samples_per_frame must be at least 1, got {self.noise_samples_per_frame}",
-        )
         usable = self.horizon - self.n_obs_steps + 1
         require(
             self.n_action_steps <= usable,
