@@ -14,9 +14,10 @@ from lerobot_agpd.cli.import_pusht import ImportPushTConfig
 from lerobot_agpd.cli.import_robomimic import ImportRobomimicConfig
 from lerobot_agpd.envs.aloha import AlohaStateEnvConfig
 from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
+from lerobot_agpd.envs.point_maze import PointMazeWaysEnv
 from lerobot_agpd.envs.robomimic import RobomimicEnvConfig
 
-ENVIRONMENTS = (AlohaStateEnvConfig, GymnasiumRoboticsEnv, RobomimicEnvConfig)
+ENVIRONMENTS = (AlohaStateEnvConfig, GymnasiumRoboticsEnv, PointMazeWaysEnv, RobomimicEnvConfig)
 COMMANDS = (DemosConfig, ImportPushTConfig, ImportRobomimicConfig)
 
 

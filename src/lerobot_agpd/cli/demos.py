@@ -28,6 +28,8 @@ from lerobot_agpd.dataset_writer import DatasetWriter, flag, image, vector
 from lerobot_agpd.envs.base import SingleEnvConfig
 from lerobot_agpd.envs.demonstrations import SKILL, DemosReport, successful_episodes
 from lerobot_agpd.envs.experts import make_expert
+from lerobot_agpd.envs.experts.base import Expert
+from lerobot_agpd.envs.experts.point_maze import WaysExpert
 
 logger = logging.getLogger(__name__)
 
@@ -53,6 +55,8 @@ class DemosConfig:
     seed: int = 0
     # 1 is the expert, 0 the worst operator; "[1,0.5]": two operators in turn.
     skill: float | list[float] = 1.0
+    # point_maze_ways only: fraction of the episodes on each way, e.g. "[0.25,0.25,0.5]"; default: all alike.
+    ways: list[float] | None = None
     # Upload the dataset when it is done.
     push_to_hub: bool = False
 
@@ -63,7 +67,7 @@ class DemosConfig:
             ValueError: if the task has no expert, or an option is impossible.
             FileExistsError: if `root` exists.
         """
-        make_expert(self.env)
+        self.make_expert()
         if not self.skills or not all(0 <= skill <= 1 for skill in self.skills):
             raise ValueError(f"--skill={self.skill} must be one or several numbers in [0, 1].")
         if self.episodes < 1:
@@ -75,6 +79,19 @@ class DemosConfig:
             )
         if self.root.exists():
             raise FileExistsError(f"--root={self.root} already exists; choose a new folder.")
+
+    def make_expert(self) -> Expert | WaysExpert:
+        """Expert of the task, with the requested fractions of the ways.
+
+        Raises:
+            ValueError: if the task has no expert, or not these ways.
+        """
+        expert = make_expert(self.env)
+        if self.ways is None:
+            return expert
+        if not isinstance(expert, WaysExpert):
+            raise ValueError(f"--ways={self.ways}: the expert of --env.task={self.env.task} knows one way.")
+        return expert.with_ways(self.ways)
 
     @property
     def skills(self) -> list[float]:
@@ -118,7 +135,7 @@ def record_demos(config: DemosConfig) -> DemosReport:
     env = config.env.make_single()
     episodes = successful_episodes(
         env,
-        make_expert(config.env),
+        config.make_expert(),
         config.env.features_map,
         config.skills,
         config.episodes,

@@ -1,0 +1,153 @@
+"""The simulation of `point_maze_ways`: PointMaze's ball and walls, with exits of which any is the goal."""
+
+import tempfile
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from gymnasium_robotics.envs.maze.maze_v4 import Maze
+from gymnasium_robotics.envs.maze.point import PointEnv
+
+from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS, image_space, unbounded
+from lerobot_agpd.envs.rendering import SceneRenderer
+from lerobot_agpd.envs.robotics_tasks import OBSERVED_KEYS
+from lerobot_agpd.envs.ways import ACTION_DIM, AGENT_POS_DIM, FPS, WALL, WaysTask, get_task
+
+WALL_HEIGHT = 0.4  # meters, PointMaze's
+GOAL_RADIUS = 0.45  # meters, PointMaze's
+START_NOISE = 0.15  # meters in x and y, at most
+FRAME_SKIP = 5
+assert FRAME_SKIP * FPS == 100  # PointMaze's steps per second
+
+
+@dataclass(frozen=True)
+class View:
+    """Type of the observation, and sizes of images, (height, width) in pixels."""
+
+    obs_type: str = "state"
+    observation_size: tuple[int, int] = (96, 96)
+    visualization_size: tuple[int, int] = (480, 480)
+
+
+def build_point(task: WaysTask) -> PointEnv:
+    """Build PointMaze's ball between the walls of a task, every exit marked."""
+    cells: list[list[int | str]] = [[1 if cell == WALL else 0 for cell in row] for row in task.maze]
+    ball = Path(mujoco_assets()) / "point.xml"
+    _, written = Maze.make_maze(str(ball), cells, maze_size_scaling=1, maze_height=WALL_HEIGHT)
+    tree = ET.parse(written)
+    Path(written).unlink()
+    world = tree.find(".//worldbody")
+    assert world is not None
+    world.remove(next(site for site in world.findall("site") if site.get("name") == "target"))
+    for i, (x, y) in enumerate(task.exits):
+        ET.SubElement(
+            world, "site", name=f"exit_{i}", pos=f"{x} {y} 0", size=f"{GOAL_RADIUS}", rgba="1 0 0 0.4"
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "maze.xml"
+        tree.write(path)
+        point = PointEnv(xml_file=str(path))
+    point.frame_skip = FRAME_SKIP
+    return point
+
+
+def mujoco_assets() -> str:
+    """Folder of PointMaze's model."""
+    import gymnasium_robotics
+
+    return str(Path(gymnasium_robotics.__file__).parent / "envs" / "assets" / "point")
+
+
+class PointMazeWays(gym.Env):
+    """One task of `ways.TASKS` with LeRobot's raw keys.
+
+    `agent_pos` (4,) is the ball's position and velocity, `environment_state` the vectors from the ball to all exits.
+    An action is a force in PointMaze's units. Reaching any exit ends the episode with `info["is_success"]`.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
+
+    def __init__(self, task: str, view: View | None = None, render_mode: str = "rgb_array") -> None:
+        """Build the simulation; no graphics context is opened before the first image.
+
+        Args:
+            task: key of `ways.TASKS`.
+            view: what to observe; the state by default.
+            render_mode: only `rgb_array`.
+
+        Raises:
+            ValueError: if the task is not known.
+        """
+        self.view = view or View()
+        self.spec_of_task = get_task(task)
+        self.task = task
+        self.task_description = self.spec_of_task.description
+        self.render_mode = render_mode
+        self.point = build_point(self.spec_of_task)
+        self.scene_renderer = SceneRenderer()
+        spaces: dict[str, gym.Space] = {
+            AGENT_POS: unbounded(AGENT_POS_DIM),
+            ENVIRONMENT_STATE: unbounded(self.spec_of_task.environment_state_dim),
+            PIXELS: image_space(*self.view.observation_size),
+        }
+        self.observation_space = gym.spaces.Dict({key: spaces[key] for key in self._keys})
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (ACTION_DIM,), dtype=np.float32)
+        self.state: dict[str, np.ndarray] = {}
+        """`agent_pos` and `environment_state` of the last observation, also where `view` shows images: for experts."""
+
+    @property
+    def _keys(self) -> tuple[str, ...]:
+        return OBSERVED_KEYS[self.view.obs_type]
+
+    def _observe(self) -> dict[str, np.ndarray]:
+        position, velocity = self.point.data.qpos, self.point.data.qvel
+        self.state = {
+            AGENT_POS: np.concatenate([position, velocity], dtype=np.float32),
+            ENVIRONMENT_STATE: (self.spec_of_task.exits - position).astype(np.float32).ravel(),
+        }
+        observation = {key: value for key, value in self.state.items() if key in self._keys}
+        if PIXELS in self._keys:
+            observation[PIXELS] = self._image(self.view.observation_size)
+        return observation
+
+    @property
+    def is_success(self) -> bool:
+        """Whether the ball is at an exit."""
+        distances = np.linalg.norm(self.spec_of_task.exits - self.point.data.qpos, axis=1)
+        return bool(distances.min() <= GOAL_RADIUS)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Put the ball at rest near the start, where the seed says, or without one the last seed."""
+        super().reset(seed=seed)
+        noise = self.np_random.uniform(-START_NOISE, START_NOISE, size=2)
+        self.point.init_qpos[:] = self.spec_of_task.start + noise
+        self.point.reset()
+        return self._observe(), {"is_success": self.is_success}
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """One control step of 50 ms; the reward is 1 at an exit and 0 elsewhere."""
+        self.point.step(np.asarray(action, dtype=np.float64))
+        success = self.is_success
+        return self._observe(), float(success), success, False, {"is_success": success}
+
+    def render(self) -> np.ndarray:
+        """Frame of `view.visualization_size`, seen from above."""
+        return self._image(self.view.visualization_size)
+
+    def _image(self, size: tuple[int, int]) -> np.ndarray:
+        camera = mujoco.MjvCamera()
+        camera.elevation, camera.azimuth = -90, 90
+        extent = max(len(self.spec_of_task.maze), len(self.spec_of_task.maze[0]))
+        camera.distance = 1.25 * extent
+        return self.scene_renderer.render(self.point.model, self.point.data, camera, size)
+
+    def close(self) -> None:
+        """Free the graphics contexts and the simulation."""
+        self.scene_renderer.close()
+        self.point.close()

@@ -1,0 +1,177 @@
+"""Maze tasks that can be done in several ways, and which way an episode took.
+
+A task is a map in PointMaze's cells of one meter and a list of choices. Every option of a choice is a short list of
+waypoints; a way takes one option of every choice, so a task has the product of their numbers. Nothing here needs a
+simulator.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Points = tuple[tuple[float, float], ...]
+
+FPS = 20
+"""Control steps per second: five of PointMaze's steps of 10 ms each."""
+
+AGENT_POS_DIM, ACTION_DIM = 4, 2
+
+WALL, START, EXIT = "#", "r", "g"
+"""Cells of a map; every other cell is free."""
+
+
+@dataclass(frozen=True)
+class WaysTask:
+    """A maze with several ways through it.
+
+    Attributes:
+        description: instruction for policies that read one.
+        maze: rows of the map, north first, one character per cell: `WALL`, `START`, `EXIT` or free.
+        choices: for every choice the waypoints of each option, meters, the map's center being the origin.
+        episode_length: steps after which an episode is truncated.
+        speed: of the expert, m/s.
+    """
+
+    description: str
+    maze: tuple[str, ...]
+    choices: tuple[tuple[Points, ...], ...]
+    episode_length: int
+    speed: float
+
+    def _centers(self, cell: str) -> Array:
+        """Centers (N, 2) of the cells of a kind, in reading order; PointMaze has the same coordinates."""
+        height, width = len(self.maze), len(self.maze[0])
+        found = [(i, j) for i, row in enumerate(self.maze) for j, kind in enumerate(row) if kind == cell]
+        return np.array([(j + 0.5 - width / 2, height / 2 - i - 0.5) for i, j in found])
+
+    @cached_property
+    def start(self) -> Array:
+        """Center (2,) of the cell in which episodes begin."""
+        return self._centers(START)[0]
+
+    @cached_property
+    def exits(self) -> Array:
+        """Centers (N, 2) of the cells of which any is the goal."""
+        return self._centers(EXIT)
+
+    @property
+    def n_ways(self) -> int:
+        """Number of ways."""
+        return math.prod(len(options) for options in self.choices)
+
+    @property
+    def environment_state_dim(self) -> int:
+        """Length of the vectors from the point to all exits."""
+        return 2 * len(self.exits)
+
+    def options_of(self, way: int) -> tuple[int, ...]:
+        """Option of every choice that a way takes; the first choice counts most."""
+        return tuple(int(index) for index in np.unravel_index(way, [len(choice) for choice in self.choices]))
+
+    def waypoints(self, way: int) -> Array:
+        """Waypoints (N, 2) of a way, the exit nearest to the last option at the end."""
+        chosen = zip(self.choices, self.options_of(way), strict=True)
+        points = [point for options, index in chosen for point in options[index]]
+        distances = np.linalg.norm(self.exits - np.array(points[-1]), axis=1)
+        return np.array([*points, self.exits[distances.argmin()]])
+
+    def way_of(self, states: Array) -> int:
+        """Way that a successful episode took: of every choice the option whose waypoints it came nearest to.
+
+        Args:
+            states: (T, >= 2) of the episode, position first: `agent_pos` or `observation.state`.
+
+        Returns:
+            Number of the way, in [0, n_ways).
+        """
+        indices = [
+            int(np.argmin([_mean_distance(states[:, :2], option) for option in options]))
+            for options in self.choices
+        ]
+        return int(np.ravel_multi_index(indices, [len(options) for options in self.choices]))
+
+
+def _mean_distance(positions: Array, waypoints: Points) -> float:
+    """Mean over waypoints of the distance at which a path (T, 2) passes them."""
+    offsets = np.asarray(positions)[:, None] - np.array(waypoints)  # (T, N, 2)
+    return float(np.linalg.norm(offsets, axis=-1).min(axis=0).mean())
+
+
+def _round_by(x: float) -> tuple[Points, Points]:
+    """Past an obstacle of one cell at (x, 0) on its north or south side, eastward."""
+    return ((x - 0.5, 1.0), (x + 0.5, 1.0)), ((x - 0.5, -1.0), (x + 0.5, -1.0))
+
+
+TASKS: dict[str, WaysTask] = {
+    "TwoWays-v0": WaysTask(
+        description="Go round the obstacle to the goal.",
+        maze=(
+            "#######",
+            "#..g..#",
+            "#.....#",
+            "#.###.#",
+            "#.....#",
+            "#..r..#",
+            "#######",
+        ),
+        choices=((((-2.0, -0.5), (-2.0, 0.5)), ((2.0, -0.5), (2.0, 0.5))),),
+        episode_length=160,
+        speed=1.3,
+    ),
+    "ThreeExits-v0": WaysTask(
+        description="Leave the room through any exit.",
+        maze=(
+            "###g###",
+            "#.....#",
+            "#.....#",
+            "#..r..#",
+            "#.....#",
+            "#.....#",
+            "#g###g#",
+        ),
+        choices=((((0.0, 2.1), (0.0, 3.0)), ((-2.0, -2.1), (-2.0, -3.0)), ((2.0, -2.1), (2.0, -3.0))),),
+        episode_length=120,
+        speed=1.0,
+    ),
+    "Chain-v0": WaysTask(
+        description="Pass the three obstacles and reach the goal.",
+        maze=(
+            "#############",
+            "#...........#",
+            "#r.#..#..#.g#",
+            "#...........#",
+            "#############",
+        ),
+        choices=(_round_by(-3.0), _round_by(0.0), _round_by(3.0)),
+        episode_length=220,
+        speed=2.0,
+    ),
+}
+"""`--env.task` to task."""
+
+
+def get_task(name: str | None) -> WaysTask:
+    """Look a task up.
+
+    Raises:
+        ValueError: if it is not known.
+    """
+    if name not in TASKS:
+        raise ValueError(f"--env.task={name} is unknown. Tasks: {', '.join(TASKS)}.")
+    return TASKS[name]
+
+
+def way_fractions(ways: Sequence[int], n_ways: int) -> list[float]:
+    """Fraction of episodes on each way.
+
+    Args:
+        ways: of the episodes.
+        n_ways: of the task.
+    """
+    counts = np.bincount(ways, minlength=n_ways)
+    return [float(count) for count in counts / max(len(ways), 1)]
