@@ -46,7 +46,7 @@ class PointMazeWaysEnv(SingleEnvConfig, EnvConfig):
 
     # Maze.
     task: Task | None = "ThreeExits-v0"
-    # Control steps per second; there are 20 only.
+    # Control steps per second; there are 10 only.
     fps: int = FPS
     # Steps after which an episode is truncated; default: the task's own limit.
     episode_length: int | None = None

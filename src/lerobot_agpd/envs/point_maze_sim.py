@@ -20,7 +20,7 @@ from lerobot_agpd.envs.ways import ACTION_DIM, AGENT_POS_DIM, FPS, WALL, WaysTas
 WALL_HEIGHT = 0.4  # meters, PointMaze's
 GOAL_RADIUS = 0.45  # meters, PointMaze's
 START_NOISE = 0.15  # meters in x and y, at most
-FRAME_SKIP = 5
+FRAME_SKIP = 10
 assert FRAME_SKIP * FPS == 100  # PointMaze's steps per second
 
 
@@ -131,7 +131,7 @@ class PointMazeWays(gym.Env):
         return self._observe(), {"is_success": self.is_success}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """One control step of 50 ms; the reward is 1 at an exit and 0 elsewhere."""
+        """One control step of 0.1 s; the reward is 1 at an exit and 0 elsewhere."""
         self.point.step(np.asarray(action, dtype=np.float64))
         success = self.is_success
         return self._observe(), float(success), success, False, {"is_success": success}

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Points = tuple[tuple[float, float], ...]
 
-FPS = 20
-"""Control steps per second: five of PointMaze's steps of 10 ms each."""
+FPS = 10
+"""Control steps per second: ten of PointMaze's steps of 10 ms each. A chunk of eight actions then lasts long enough
+to decide which way the ball goes."""
 
 AGENT_POS_DIM, ACTION_DIM = 4, 2
 
@@ -120,23 +121,30 @@ TASKS: dict[str, WaysTask] = {
             "#######",
         ),
         choices=((((-2.0, -0.5), (-2.0, 0.5)), ((2.0, -0.5), (2.0, 0.5))),),
-        episode_length=160,
+        episode_length=100,
         speed=1.3,
     ),
     "ThreeExits-v0": WaysTask(
         description="Leave the room through any exit.",
         maze=(
             "###g###",
-            "#.....#",
+            "###.###",
+            "###.###",
+            "###.###",
+            "###.###",
+            "###.###",
             "#.....#",
             "#..r..#",
             "#.....#",
-            "#.....#",
+            "#.#.#.#",
+            "#.#.#.#",
+            "#.###.#",
+            "#.###.#",
             "#g###g#",
         ),
-        choices=((((0.0, 2.1), (0.0, 3.0)), ((-2.0, -2.1), (-2.0, -3.0)), ((2.0, -2.1), (2.0, -3.0))),),
-        episode_length=120,
-        speed=1.0,
+        choices=((((0.0, 1.1), (0.0, 6.5)), ((-2.0, -2.1), (-2.0, -6.5)), ((2.0, -2.1), (2.0, -6.5))),),
+        episode_length=60,
+        speed=2.5,
     ),
     "Chain-v0": WaysTask(
         description="Pass the three obstacles and reach the goal.",
@@ -148,7 +156,7 @@ TASKS: dict[str, WaysTask] = {
             "#############",
         ),
         choices=(_round_by(-3.0), _round_by(0.0), _round_by(3.0)),
-        episode_length=220,
+        episode_length=130,
         speed=2.0,
     ),
 }

@@ -16,9 +16,9 @@ from lerobot_agpd.envs.ways import TASKS
 # Acceleration at an action of 1 of PointMaze's ball of 4.19 kg with a gear of 100, m/s^2.
 ACCELERATION = 23.9
 # Seconds in which the controller makes up for a difference in velocity.
-VELOCITY_TIME = 0.3
+VELOCITY_TIME = 0.15
 # Distance at which the next waypoint takes over, meters.
-WAYPOINT_RADIUS = 0.25
+WAYPOINT_RADIUS = 0.4
 # Standard deviation of the force's noise, action units, and its correlation from one step to the next.
 NOISE = 0.02
 NOISE_CORRELATION = 0.8
