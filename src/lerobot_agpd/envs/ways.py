@@ -6,7 +6,6 @@ simulator.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -172,14 +171,3 @@ def get_task(name: str | None) -> WaysTask:
     if name not in TASKS:
         raise ValueError(f"--env.task={name} is unknown. Tasks: {', '.join(TASKS)}.")
     return TASKS[name]
-
-
-def way_fractions(ways: Sequence[int], n_ways: int) -> list[float]:
-    """Fraction of episodes on each way.
-
-    Args:
-        ways: of the episodes.
-        n_ways: of the task.
-    """
-    counts = np.bincount(ways, minlength=n_ways)
-    return [float(count) for count in counts / max(len(ways), 1)]
