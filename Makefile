@@ -15,7 +15,7 @@ help:  ## this list
 setup: $(filter .uv/bin/uv,$(UV))  ## install the package with all extras into .venv (needs Python 3.12)
 	@$(UV) sync --frozen --all-extras
 
-quickstart: setup  ## distil a teacher on FetchPickAndPlace, offline, in 15 to 30 minutes
+quickstart: setup  ## distill a teacher on FetchPickAndPlace, offline, in 15 to 30 minutes
 	@PATH="$(CURDIR)/.venv/bin:$$PATH" bash examples/quickstart.sh
 
 test: setup  ## all tests, fast ones first

@@ -11,8 +11,7 @@ from typing import Any
 from lerobot_agpd.rollout.report import RoundReport
 from lerobot_agpd.studies.evaluation import Evaluation
 from lerobot_agpd.studies.latency import Latency
-from lerobot_agpd.studies.results import Result, RunResult
-from lerobot_agpd.studies.run_results import read_result
+from lerobot_agpd.studies.results import Result
 
 Json = dict[str, Any]
 
@@ -77,11 +76,6 @@ def run(content: Json) -> Json:
     """A `run.json`."""
     rounds = [round_report(entry) for entry in content["rounds"]]
     return {**content, "flags": flags(content["flags"]), "rounds": rounds}
-
-
-def read_run(run_: Any, matrix: Any) -> RunResult | None:
-    """The committed result of a run of a matrix."""
-    return read_result(run_, matrix, translate=run)
 
 
 def read_report(path: Path) -> list[Result]:

@@ -136,7 +136,7 @@ def read_comparison(path: Path) -> tuple[Matrix, Results, list[str]] | None:
     os.environ["AGPD_RUNS"] = root.rpartition("/data/")[0]  # where the runs were made: part of their flags
     matrix = load_matrix(path)
     matrix.output = folder
-    return matrix, *read_results(matrix, committed.read_run)
+    return matrix, *read_results(matrix, committed.run)
 
 
 def comparison_page(path: Path, matrix: Matrix, results: Results, missing: list[str]) -> str:

@@ -1,4 +1,4 @@
-# What the examples share: record demonstrations, train a teacher, distil it, evaluate. Source it; every step that is
+# What the examples share: record demonstrations, train a teacher, distill it, evaluate. Source it; every step that is
 # finished is skipped when the script runs again, an interrupted training goes on from its last checkpoint.
 set -euo pipefail
 presets=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)/presets
@@ -56,8 +56,8 @@ cloning() {
         --steps="$STUDENT_STEPS" --policy.collect.every=0 --policy.adversary.weight=0 "${@:3}"
 }
 
-# distil FOLDER DATASET TEACHER FLAGS...: the same student with five guided rounds and the adversary
-distil() {
+# distill FOLDER DATASET TEACHER FLAGS...: the same student with five guided rounds and the adversary
+distill() {
     local every=$((STUDENT_STEPS * 3 / 20)) warmup=$((STUDENT_STEPS / 8))
     train "$1" --config_path="$presets/student_cpu.yaml" --dataset.repo_id=local/student --dataset.root="$2" \
         --steps="$STUDENT_STEPS" --policy.teacher.path="$3/checkpoints/last/pretrained_model" \

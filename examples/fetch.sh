@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Fetch: scripted demonstrations, a diffusion teacher, a distilled student. Half an hour on one CPU core.
 # usage: examples/fetch.sh [task, default FetchPickAndPlace-v4] [output folder]
-# The low-quality setting, a student that sees operators of mixed skill: SKILL="[1,0.75,0.5,0.25]" examples/fetch.sh FetchPush-v4 outputs/mixture
+# With demonstrations of operators of mixed skill (the low-quality setting) for the student:
+#   SKILL="[1,0.75,0.5,0.25]" examples/fetch.sh FetchPush-v4 outputs/mixture
 source "$(dirname "$0")/common.sh"
 task=${1:-FetchPickAndPlace-v4}
 output=${2:-outputs/$task}
@@ -14,5 +15,5 @@ slow=()
 record "$output/few" "$FEW" 5000 "${env[@]}" "${slow[@]}" --skill="$SKILL"
 teacher "$output/teacher" "$output/many"
 cloning "$output/cloning" "$output/few"
-distil "$output/agpd" "$output/few" "$output/teacher" "${env[@]}"
+distill "$output/agpd" "$output/few" "$output/teacher" "${env[@]}"
 report "$output" "${env[@]}" --title="$task, $FEW demonstrations"

@@ -15,5 +15,5 @@ settings "$output"
 teacher "$output/teacher" "$output/many" --policy.mlp.width=640 --policy.mlp.n_blocks=4 --policy.optimizer_lr=5e-4
 cloning "$output/cloning" "$output/few"
 # Coverage above 0.95 is rare even among people: an episode is kept from 0.9 of the reward on.
-distil "$output/agpd" "$output/few" "$output/teacher" "${env[@]}" --policy.collect.min_reward=0.9
+distill "$output/agpd" "$output/few" "$output/teacher" "${env[@]}" --policy.collect.min_reward=0.9
 report "$output" "${env[@]}" --title="Push-T, $FEW demonstrations"

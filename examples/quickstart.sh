@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# The main job in a quarter of an hour (half an hour if they are busy) on two CPU cores, offline: clone ten demonstrations of FetchPickAndPlace, distil a
-# diffusion teacher into the same student, compare. How the teacher and the demonstrations were made is at the end.
+# Clone ten demonstrations of FetchPickAndPlace, distill a diffusion teacher into the same student, and compare them.
+# Offline, a quarter of an hour on two CPU cores (half an hour if they are busy). How the teacher and the demonstrations
+# were made is at the end.
 # usage: examples/quickstart.sh [output folder, default outputs/quickstart]
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
@@ -29,7 +30,7 @@ logged() {
     fi
 }
 
-echo "== 1/4 in the background: behaviour cloning of ten demonstrations"
+echo "== 1/4 in the background: behavior cloning of ten demonstrations"
 lerobot-train "${student[@]}" --output_dir="$output/cloning" --policy.collect.every=0 --policy.adversary.weight=0 \
     >"$output/cloning.log" 2>&1 &
 cloning=$!

@@ -22,18 +22,23 @@ def create_dataset(root) -> LeRobotDataset:
     )
 
 
-def make_dataset(root, lengths=LENGTHS, seed=0) -> LeRobotDataset:
-    """Episodes of random frames; `observation.state` is (episode, step), so that every frame is known by it."""
+def make_dataset(root, lengths=LENGTHS, seed=0, gripper=None) -> LeRobotDataset:
+    """Episodes of random frames; `observation.state` is (episode, step), so that every frame is known by it.
+
+    Given `gripper`, the second dimension of the action always has that value.
+    """
     rng = np.random.default_rng(seed)
     dataset = create_dataset(root)
     for episode, length in enumerate(lengths):
         for step in range(length):
             last = step == length - 1
+            environment_state, action = rng.normal(5, 3, 3), rng.normal(-2, 4, 2)
+            action[1] = action[1] if gripper is None else gripper
             dataset.add_frame(
                 {
                     "observation.state": np.array([episode, step], dtype=np.float32),
-                    "observation.environment_state": rng.normal(5, 3, 3).astype(np.float32),
-                    "action": rng.normal(-2, 4, 2).astype(np.float32),
+                    "observation.environment_state": environment_state.astype(np.float32),
+                    "action": action.astype(np.float32),
                     "next.reward": np.array([step], dtype=np.float32),
                     "next.success": np.array([last]),
                     "next.done": np.array([last]),

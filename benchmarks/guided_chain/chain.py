@@ -12,8 +12,11 @@ import torch
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 
+from lerobot_agpd.guidance import guide as guidance
 from lerobot_agpd.guidance.discrepancy import ActionDiscrepancy
 from lerobot_agpd.guidance.guide import Guide, GuidedScheduler
+
+guidance.TRUST_REGION = 1e9
 
 STD, STUDENT, N = 0.3, 0.3, 40_000
 SCALES = (0.5, 1.0, 2.0, 4.0, 16.0)
@@ -29,7 +32,7 @@ def final_mean(scheduler_class: type, n_steps: int, scale: float, at: str) -> fl
     """Mean of N guided samples over the student's position."""
     generator = torch.Generator().manual_seed(0)
     target = torch.full((N, 1, 1), STUDENT)
-    guide = Guide(ActionDiscrepancy(target, 0), torch.full((N,), scale), at=at, trust_region=1e9)
+    guide = Guide(ActionDiscrepancy(target, 0), torch.full((N,), scale), at=at)
     plain = scheduler_class(num_train_timesteps=100, beta_schedule="squaredcos_cap_v2", clip_sample=False)
     scheduler = GuidedScheduler(plain, guide)
     scheduler.set_timesteps(n_steps)

@@ -30,8 +30,8 @@ train act_dp "$many" act_diffusion_cpu 6000
 train act_cloning "$few" student_cpu 4000 "${alone[@]}"
 train act_student "$few" student_cpu 4000 "${rounds[@]}" "${env[@]}" \
     --policy.teacher.path="$output/act_dp/checkpoints/last/pretrained_model"
-train dp_t_cloning "$few" self_distil_cpu 4000 "${alone[@]}"
-train dp_t_self "$few" self_distil_cpu 4000 "${rounds[@]}" "${env[@]}"
+train dp_t_cloning "$few" self_distill_cpu 4000 "${alone[@]}"
+train dp_t_self "$few" self_distill_cpu 4000 "${rounds[@]}" "${env[@]}"
 
 lerobot-agpd-report "${env[@]}" --output="$output/report" --title="FetchPush, 20 demonstrations" --episodes=300 \
     --policies="{ACT-DP teacher: $output/act_dp/checkpoints/last/pretrained_model}" \

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from lerobot_agpd.envs.base import AGENT_POS
 from lerobot_agpd.envs.experts.point_maze import WaysExpert
 from lerobot_agpd.envs.point_maze import PointMazeWaysEnv
-from lerobot_agpd.envs.ways import ACTION_DIM, AGENT_POS_DIM, TASKS
+from lerobot_agpd.envs.ways import TASKS
 
 RESULT = Path(__file__).parent / "average.json"
 CHUNK, EXECUTED = 16, 8
@@ -58,11 +58,11 @@ def demonstrate(env: gym.Env, expert: WaysExpert, seed: int) -> tuple[np.ndarray
 def train(states: Tensor, chunks: Tensor, loss: nn.Module) -> nn.Module:
     """Regression network of normalized states (N, 4) to normalized chunks (N, CHUNK * 2)."""
     torch.manual_seed(0)
-    widths = [AGENT_POS_DIM, 128, 128, 128]
+    widths = [states.shape[1], 128, 128, 128]
     layers = [
         layer for i, o in zip(widths, widths[1:], strict=False) for layer in (nn.Linear(i, o), nn.SiLU())
     ]
-    network = nn.Sequential(*layers, nn.Linear(widths[-1], CHUNK * ACTION_DIM))
+    network = nn.Sequential(*layers, nn.Linear(widths[-1], chunks.shape[1]))
     optimizer = torch.optim.AdamW(network.parameters(), 1e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, STEPS)
     for _ in range(STEPS):
@@ -90,7 +90,7 @@ def run(task: str, loss: str, fractions: tuple[float, ...] | None, n_demonstrati
         while not done:
             with torch.no_grad():
                 state = (torch.tensor(observation[AGENT_POS]) - mean[0]) / std[0]
-                chunk = (network(state) * std[1] + mean[1]).view(CHUNK, ACTION_DIM).clamp(-1, 1).numpy()
+                chunk = (network(state) * std[1] + mean[1]).view(CHUNK, -1).clamp(-1, 1).numpy()
             for action in chunk[:EXECUTED]:
                 path.append(observation[AGENT_POS])
                 observation, _, terminated, truncated, info = env.step(action)

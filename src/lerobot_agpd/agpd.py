@@ -212,6 +212,7 @@ class AGPD:
                     self.journal.append(number, self.rank, episode, record)
         processes = PartialState()
         processes.wait_for_everyone()
+        self.collector.require_valid_episodes(number)
         if processes.is_main_process:
             self.journal.finish(number, self._report(number, strength, strategy).to_json())
         self.student.train(was_training)

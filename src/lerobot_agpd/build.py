@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 
 from accelerate import PartialState
@@ -123,7 +123,7 @@ def build_parts(
 
 def _teacher(config: StudentConfig) -> Teacher | None:
     """The teacher of `--policy.teacher.path`, if any part of the method uses one."""
-    if not (config.collect.enabled or config.needs_teacher_chunks):
+    if not config.uses_teacher:
         return None
     teacher = load_teacher(config.teacher, config.device or "cpu")
     if config.collect.enabled and config.needs_guidance:
@@ -189,18 +189,36 @@ def _journal(
     """The journal of the run's episodes; notes its folder in `progress`."""
     root = find_replay_root(config, run, progress)
     progress.replay_root = str(root)
-    identity = {
-        "strategy": config.collect.strategy,
-        "environment": {"type": env_config.type, "task": env_config.task},
-        "teacher": config.teacher.path,
-        "seed": seed,
-    }
+    identity = _identity(config, env_config, seed)
     journal = EpisodeJournal(root)
     processes = PartialState()
     if processes.is_main_process:
         journal.begin(demonstrations, identity, resume=progress.checkpoint is not None)
     processes.wait_for_everyone()
     return journal
+
+
+def _identity(config: StudentConfig, env_config: EnvConfig, seed: int) -> dict[str, object]:
+    """What decides a run's episodes, by flag; settings of another strategy than the run's are left out."""
+    collect = config.collect
+    identity: dict[str, object] = {
+        "strategy": collect.strategy,
+        "environment": {"type": env_config.type, "task": env_config.task},
+        "teacher": config.teacher.path,
+        "seed": seed,
+        "teacher.num_inference_steps": config.teacher.num_inference_steps,
+        "teacher.noise_scheduler": config.teacher.noise_scheduler,
+        "collect.n_action_steps": collect.n_action_steps,
+        "collect.min_reward": collect.min_reward,
+        "collect.keep_failures": collect.keep_failures,
+    }
+    if collect.guides:
+        identity["guidance.at"] = config.guidance.at
+    if collect.strategy == "mixing":
+        identity["collect.mixing"] = asdict(collect.mixing)
+    if collect.strategy == "nearest":
+        identity["collect.nearest_samples"] = collect.nearest_samples
+    return identity
 
 
 def _adopt_rounds(

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import math
 from abc import abstractmethod
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Literal
 
 import draccus
+from diffusers.optimization import SchedulerType
 from draccus.utils import ParsingError
 from huggingface_hub.constants import CONFIG_NAME
+from huggingface_hub.utils import HFValidationError, validate_repo_id
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig
 
@@ -39,6 +42,41 @@ def require(condition: bool, message: str) -> None:
     """Raise FlagError(message) unless the condition holds."""
     if not condition:
         raise FlagError(message)
+
+
+def require_finite(group: object, name: str) -> None:
+    """Refuse NaN and infinite values among the fields of a group of flags, `--policy.<name>.*`.
+
+    Raises:
+        FlagError: naming the flag.
+    """
+    for entry in fields(group):  # type: ignore[arg-type]  # a dataclass
+        value = getattr(group, entry.name)
+        require(
+            not isinstance(value, float) or math.isfinite(value),
+            f"--policy.{name}.{entry.name} must be a finite number, got {value}",
+        )
+
+
+def require_at_least(config: object, least: int, *names: str) -> None:
+    """Refuse integers of a policy's configuration, `--policy.<name>`, below a limit; None is allowed.
+
+    Raises:
+        FlagError: naming the flag.
+    """
+    for name in names:
+        value = getattr(config, name)
+        require(value is None or value >= least, f"--policy.{name} must be at least {least}, got {value}")
+
+
+def require_scheduler(name: str | None) -> None:
+    """Refuse a learning rate schedule that diffusers does not have, or that needs settings of its own.
+
+    Raises:
+        FlagError: naming those there are.
+    """
+    known = [entry.value for entry in SchedulerType if entry is not SchedulerType.PIECEWISE_CONSTANT]
+    require(name is None or name in known, f"--policy.scheduler_name must be one of {known}, got '{name}'")
 
 
 @dataclass
@@ -73,6 +111,7 @@ class GuidanceConfig:
     max_scale: float = 2.0
 
     def __post_init__(self) -> None:
+        require_finite(self, "guidance")
         require(self.scale >= 0, f"--policy.guidance.scale must not be negative, got {self.scale}")
         require(self.max_scale > 0, f"--policy.guidance.max_scale must be positive, got {self.max_scale}")
 
@@ -97,6 +136,7 @@ class MixingConfig:
     record_teacher: bool = False
 
     def __post_init__(self) -> None:
+        require_finite(self, "collect.mixing")
         require(0 <= self.weight <= 1, f"--policy.collect.mixing.weight must be in [0, 1], got {self.weight}")
 
 
@@ -143,6 +183,7 @@ class CollectConfig:
     repo_id: str | None = None
 
     def __post_init__(self) -> None:
+        require_finite(self, "collect")
         require(self.every >= 0, f"--policy.collect.every must not be negative, got {self.every}")
         for name in ("warmup", "episodes", "n_envs"):
             value = getattr(self, name)
@@ -166,6 +207,14 @@ class CollectConfig:
             not self.push_to_hub or bool(self.repo_id),
             "--policy.collect.push_to_hub=true needs --policy.collect.repo_id",
         )
+        self._require_repo_id()
+
+    def _require_repo_id(self) -> None:
+        if self.repo_id is not None:
+            try:
+                validate_repo_id(self.repo_id)
+            except HFValidationError as error:
+                raise FlagError(f"--policy.collect.repo_id='{self.repo_id}': {error}") from error
 
     @property
     def enabled(self) -> bool:
@@ -190,6 +239,7 @@ class ReplayConfig:
     relabel: Relabel = "none"
 
     def __post_init__(self) -> None:
+        require_finite(self, "replay")
         require(
             self.collected_fraction is None or 0 <= self.collected_fraction < 1,
             f"--policy.replay.collected_fraction must be in [0, 1), got {self.collected_fraction}",
@@ -210,6 +260,7 @@ class AdversaryConfig:
     lr: float = 1e-4
 
     def __post_init__(self) -> None:
+        require_finite(self, "adversary")
         require(self.weight >= 0, f"--policy.adversary.weight must not be negative, got {self.weight}")
         require(self.start >= 0, f"--policy.adversary.start must not be negative, got {self.start}")
         require(self.every >= 1, f"--policy.adversary.every must be at least 1, got {self.every}")
@@ -259,6 +310,11 @@ class StudentConfig(PreTrainedConfig):
     def predicted_steps(self) -> int:
         """Those of them that `predict_action_chunk` returns."""
         return self.future_steps
+
+    @property
+    def uses_teacher(self) -> bool:
+        """Whether any part of the method uses a teacher."""
+        return self.collect.enabled or self.needs_teacher_chunks
 
     @property
     def needs_guidance(self) -> bool:

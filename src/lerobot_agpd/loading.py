@@ -21,9 +21,11 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_agpd.config import CollectConfig, FlagError, StudentConfig, TeacherConfig, require
 from lerobot_agpd.guidance.adapters import as_teacher
 from lerobot_agpd.guidance.teacher import Features, Teacher
+from lerobot_agpd.replay.gate import not_finite_statistic
 from lerobot_agpd.replay.normalization import Normalizer
 from lerobot_agpd.run import RunInfo
 from lerobot_agpd.student import Student, StudentSampler
+from lerobot_agpd.weights import not_finite_weight
 
 # ---- policies ----
 
@@ -77,7 +79,7 @@ def load_teacher(config: TeacherConfig, device: str) -> Teacher:
     """Load the teacher that `--policy.teacher.path` names, frozen.
 
     Raises:
-        FlagError: if no path is given, or a setting has no meaning for the policy.
+        FlagError: if no path is given, a setting has no meaning for the policy, or its weights are not finite.
         FileNotFoundError: if there is no policy at the path.
     """
     require(
@@ -89,9 +91,23 @@ def load_teacher(config: TeacherConfig, device: str) -> Teacher:
     policy_config = read_policy_config(config.path, "--policy.teacher.path")
     policy_config.device = device
     loaded = load_policy(policy_config)
+    _require_finite_teacher(loaded, config.path)
     teacher = as_teacher(loaded.policy.requires_grad_(False), loaded.preprocessor, loaded.postprocessor)
     teacher.set_sampler(config.num_inference_steps, config.noise_scheduler)
     return teacher
+
+
+def _require_finite_teacher(loaded: LoadedPolicy, path: str) -> None:
+    """Refuse a policy whose weights or statistics hold NaN: every chunk of it would be NaN too."""
+    steps = (step for step in loaded.preprocessor.steps if isinstance(step, NormalizerProcessorStep))
+    bad = not_finite_weight(loaded.policy)
+    for step in steps:
+        bad = bad or not_finite_statistic(step.stats or {})
+    require(
+        bad is None,
+        f"--policy.teacher.path='{path}': {bad} is not finite, its training has probably diverged; choose an earlier "
+        "checkpoint of it (<output_dir>/checkpoints/<step>/pretrained_model)",
+    )
 
 
 def load_student(config: PreTrainedConfig) -> StudentSampler:

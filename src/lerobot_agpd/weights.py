@@ -1,7 +1,8 @@
-"""Reading and writing checkpoints: a strict check of weights, and which process writes files."""
+"""Reading and writing checkpoints: strict checks of weights, and which process writes files."""
 
 from __future__ import annotations
 
+import torch
 from safetensors import SafetensorError, safe_open
 from torch import nn
 
@@ -37,6 +38,20 @@ def require_weights(model: nn.Module, file: str, optional: tuple[str, ...] = ())
             f"{file} does not fit the policy that its config.json describes; missing: {missing[:5]} "
             f"({len(missing)} in all), of another shape: {wrong[:5]} ({len(wrong)} in all)"
         )
+
+
+def not_finite_weight(model: nn.Module) -> str | None:
+    """Name of the first tensor of a model that holds NaN, or as a parameter infinite values; None if there is none.
+
+    A buffer may hold infinite values on purpose: attention masks do.
+    """
+    parameters = dict(model.named_parameters())
+    for name, tensor in model.state_dict(keep_vars=True).items():
+        if tensor.is_floating_point() and bool(torch.isnan(tensor).any()):
+            return name
+        if name in parameters and not bool(torch.isfinite(tensor).all()):
+            return name
+    return None
 
 
 def is_main_process() -> bool:

@@ -9,7 +9,8 @@ from lerobot.envs.configs import PushtEnv
 from lerobot_agpd.studies.parsing import decode_environment
 
 PARSED = {
-    "import_pusht": (["--source=nowhere", "--root=x"], "nowhere"),
+    "import_pusht": (["--source=nowhere", "--root=x"], "--source=nowhere"),
+    "import_robomimic": (["nowhere.hdf5", "--root=x"], "--source=nowhere.hdf5"),
     "merge": (["--root=nowhere"], "--root=nowhere is not a folder"),
     "report": (["--env.type=pusht", "--output=x", "--episodes=1", "--policies={a: .}"], "--episodes must be"),
     "demos": (["--env.type=gymnasium_robotics", "--root=x", "--episodes=0"], "--episodes"),
@@ -67,7 +68,7 @@ def plugin(monkeypatch, tmp_path, request) -> str:
     return name
 
 
-@pytest.mark.parametrize("name", ["report", "viz", "diversity"])
+@pytest.mark.parametrize("name", ["report", "viz", "diversity", "demos"])
 def test_an_environment_of_another_package(name, monkeypatch, tmp_path, plugin):
     """The flags are read, and the command ends at what is wrong with the rest."""
     args = [f"--env.discover_packages_path={plugin}", f"--env.type={plugin}", "--env.extra=3"]
@@ -75,9 +76,10 @@ def test_an_environment_of_another_package(name, monkeypatch, tmp_path, plugin):
         "report": ["--output=x", "--policies={a: .}", "--episodes=1"],
         "viz": [],
         "diversity": ["--output=x"],
+        "demos": ["--root=x"],
     }
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit, match="--episodes must be|--policy.path is not set"):
+    with pytest.raises(SystemExit, match="--episodes must be|--policy.path is not set|no scripted exp"):
         main(name, monkeypatch, *args, *others[name])()
 
 

@@ -13,48 +13,62 @@ import yaml
 from rich.console import Console
 
 from lerobot_agpd.cli.compare import CompareConfig, load
-from lerobot_agpd.studies.jobs import Job, Step, activity, run_jobs
+from lerobot_agpd.config import FlagError
+from lerobot_agpd.studies.jobs import Job, run_jobs
 
 pytest.importorskip("lerobot_policy_agpd")  # registers the environment types
 
 ROOT = Path(__file__).parents[2]
 
 
-def python(code: str):
-    return lambda: [sys.executable, "-S", "-c", code]
+def python(code: str) -> list[str]:
+    return [sys.executable, "-S", "-c", code]
 
 
-def step(tmp_path: Path, code: str, **options) -> Step:
-    return Step(python(code), tmp_path / "log", **options)
+def job(tmp_path: Path, name: str, *codes: str) -> Job:
+    """Runs Python programs one after the other."""
+
+    def work(execute) -> None:
+        for code in codes:
+            execute(python(code), tmp_path / f"{name}.log")
+
+    return Job(name, tmp_path / name, work)
 
 
-# ---- job control ----
+# ---- job control
 
 
-def test_jobs_run_their_steps_in_order_and_report_failures(tmp_path):
-    codes = []
+def test_jobs_run_their_commands_in_order_and_report_failures(tmp_path):
     write = "import os; open('{}', 'a').write(os.environ['OMP_NUM_THREADS'])"
-    good = Job(
-        "good",
-        tmp_path / "good",
-        [
-            step(tmp_path, write.format(tmp_path / "a"), done=codes.append),
-            Step(lambda: None, tmp_path / "log"),
-            step(tmp_path, f"assert open({str(tmp_path / 'a')!r}).read() == '3'", done=codes.append),
-        ],
-    )
-    bad = Job(
-        "bad",
-        tmp_path / "bad",
-        [
-            Step(python("import sys; sys.exit('the reason')"), tmp_path / "bad.log"),
-            step(tmp_path, write.format(tmp_path / "never")),
-        ],
-    )
-    failures = run_jobs([good, bad], at_once=2, threads=3, console=Console(quiet=True))
-    assert codes == [0, 0]
+    check = f"assert open({str(tmp_path / 'a')!r}).read() == '3'; open({str(tmp_path / 'b')!r}, 'w')"
+    good = job(tmp_path, "good", write.format(tmp_path / "a"), check)
+    bad = job(tmp_path, "bad", "import sys; sys.exit('the reason')", write.format(tmp_path / "never"))
+    failures = run_jobs([bad, good], at_once=1, threads=3, console=Console(quiet=True))
+    assert (tmp_path / "b").exists()
     assert list(failures) == ["bad"] and "ended with 1" in failures["bad"] and "the reason" in failures["bad"]
     assert not (tmp_path / "never").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_an_interrupt_ends_what_was_started(tmp_path, number):
+    parent = f"""
+import sys
+from pathlib import Path
+from rich.console import Console
+from lerobot_agpd.studies.jobs import Job, run_jobs
+code = "import os, pathlib, time; pathlib.Path('{tmp_path}', str(os.getpid()) + '.pid').touch(); time.sleep(600)"
+def work(execute):
+    execute([sys.executable, "-S", "-c", code], Path("{tmp_path}/log"))
+    execute([sys.executable, "-S", "-c", code], Path("{tmp_path}/log"))
+run_jobs([Job(name, Path("{tmp_path}", name), work) for name in "abc"], 2, 1, Console(quiet=True))
+"""
+    process = subprocess.Popen([sys.executable, "-c", parent], stderr=subprocess.PIPE, text=True)
+    wait_for(lambda: len(list(tmp_path.glob("*.pid"))) == 2, process)
+    process.send_signal(number)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 1 and "run the same command to go on" in said
+    children = [int(file.stem) for file in tmp_path.glob("*.pid")]
+    assert len(children) == 2 and not any(Path(f"/proc/{child}").exists() for child in children)
 
 
 def test_a_folder_that_another_process_works_on_is_left_alone(tmp_path):
@@ -67,32 +81,25 @@ def test_a_folder_that_another_process_works_on_is_left_alone(tmp_path):
     )
     parent = (
         "import sys\nfrom pathlib import Path\nfrom rich.console import Console\n"
-        "from lerobot_agpd.studies.jobs import Job, Step, run_jobs\n"
+        "from lerobot_agpd.studies.jobs import Job, run_jobs\n"
         f"args = [sys.executable, '-S', '-c', {child!r}]\n"
-        f"run_jobs([Job('x', Path({str(tmp_path / 'x')!r}), [Step(lambda: args, Path({str(tmp_path / 'log')!r}))])],"
-        " 1, 1, Console(quiet=True))\n"
+        f"work = lambda execute: execute(args, Path({str(tmp_path / 'log')!r}))\n"
+        f"run_jobs([Job('x', Path({str(tmp_path / 'x')!r}), work)], 1, 1, Console(quiet=True))\n"
     )
     process = subprocess.Popen([sys.executable, "-c", parent])
     wait_for(ready.exists, process)
     process.kill()
     process.wait()
-    job = Job("x", tmp_path / "x", [step(tmp_path, f"open({str(again)!r}, 'w')")])
-    assert "another process works on" in run_jobs([job], 1, 1, Console(quiet=True))["x"]
+    next_one = job(tmp_path, "x", f"open({str(again)!r}, 'w')")
+    assert "another process works on" in run_jobs([next_one], 1, 1, Console(quiet=True))["x"]
     assert not again.exists()
     release.touch()
-    wait_for(lambda: not run_jobs([job], 1, 1, Console(quiet=True)))
+    wait_for(lambda: not run_jobs([next_one], 1, 1, Console(quiet=True)))
     assert again.exists()
 
 
-def test_the_last_progress_bar_of_a_log(tmp_path):
-    log = tmp_path / "log"
-    assert activity(log) == ""
-    log.write_text("Training:  10%|#    | 30/300 [00:01<\rCollecting round 1:  50%|##   | 5/10 [00:01<")
-    assert activity(log) == "Collecting round 1 5/10"
-
-
 def test_wrong_options_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="--jobs must be at least 1, got 0"):
+    with pytest.raises(FlagError, match="--jobs must be at least 1, got 0"):
         CompareConfig(matrix=tmp_path, jobs=0)
 
 
@@ -189,7 +196,7 @@ def test_a_killed_comparison_goes_on_where_it_was(tmp_path):
     assert result["curve"]["10"]["seeds"] == [500_000, 500_001, 500_002]
     assert result["last"]["step"] == STEPS and result["last"]["seeds"] == list(range(100_000, 100_006))
     assert result["best"]["step"] in (10, 20, 30) and result["config"]["steps"] == STEPS
-    assert [entry["generated"] for entry in result["rounds"]] == [6, 6]
+    assert [entry["total"]["generated"] for entry in result["rounds"]] == [6, 6]
     assert result["seconds"]["total"] > result["seconds"]["environment"] > 0
     assert result["evaluated_with"]["versions"]["lerobot"]
     text = (tmp_path / "comparison" / "report.md").read_text()

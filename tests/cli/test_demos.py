@@ -11,6 +11,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_agpd.cli import demos
 from lerobot_agpd.cli.demos import DemosConfig, record_demos, report_table
+from lerobot_agpd.config import FlagError
 from lerobot_agpd.dataset_writer import DatasetWriter
 from lerobot_agpd.envs.demonstrations import DemosReport, successful_episodes
 from lerobot_agpd.envs.experts.base import Expert
@@ -218,13 +219,13 @@ def test_tasks_without_expert_name_the_way_to_peoples_demonstrations(tmp_path, e
 
 
 def test_existing_root_is_refused(tmp_path):
-    with pytest.raises(FileExistsError, match="already exists"):
+    with pytest.raises(FlagError, match="--root="):
         reach_config(tmp_path)
 
 
 @pytest.mark.parametrize(("seed", "episodes"), [(100_000, 1), (99_999, 2), (-1, 1)])
 def test_seeds_of_evaluations_are_refused(tmp_path, seed, episodes):
-    with pytest.raises(ValueError, match="evaluations use those from 100000 on"):
+    with pytest.raises(FlagError, match="--seed=.*100000"):
         reach_config(tmp_path / "x", seed=seed, episodes=episodes)
 
 
@@ -235,12 +236,12 @@ def test_seeds_never_run_into_those_of_evaluations(tmp_path, monkeypatch):
 
 
 def test_other_requests_that_cannot_work_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="--episodes"):
+    with pytest.raises(FlagError, match="--episodes"):
         reach_config(tmp_path / "x", episodes=0)
     with pytest.raises(ValueError, match="pusht"):
         DemosConfig(root=tmp_path / "x", env=EnvConfig.get_choice_class("pusht")())
     for skill in (1.5, -0.1, [], [1.0, 2.0]):
-        with pytest.raises(ValueError, match="--skill=.* must be one or several numbers"):
+        with pytest.raises(FlagError, match="--skill="):
             reach_config(tmp_path / "x", skill=skill)
     with pytest.raises(ValueError, match="FetchSlide-v4 has no scripted expert"):
         DemosConfig(root=tmp_path / "x", env=GymnasiumRoboticsEnv(task="FetchSlide-v4"))

@@ -7,6 +7,7 @@ import pytest
 from lerobot.envs.configs import PushtEnv
 
 from lerobot_agpd.cli import diversity
+from lerobot_agpd.config import FlagError
 
 pytest.importorskip("gym_pusht")
 
@@ -14,7 +15,6 @@ pytest.importorskip("gym_pusht")
 def call(monkeypatch, student, *options: str) -> None:
     flags = ["--env.type=pusht", "--env.obs_type=environment_state_agent_pos", "--env.episode_length=12"]
     flags += [f"--policy.path={student}", "--policy.collect.n_envs=3", "--policy.collect.min_reward=1e-9"]
-    flags += ["--policy.collect.diagnostics.observations=4", "--policy.collect.diagnostics.samples=3"]
     monkeypatch.setattr(sys, "argv", ["lerobot-agpd-diversity", *flags, *options])
     diversity.main()
 
@@ -59,5 +59,5 @@ def test_sweep_measures_every_setting(monkeypatch, student, tmp_path):
 )
 def test_wrong_options_are_refused(monkeypatch, student, tmp_path, options, message):
     monkeypatch.setattr(sys, "argv", ["lerobot-agpd-diversity", f"--policy.path={student}"])
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(FlagError, match=message):
         diversity.DiversityConfig(env=PushtEnv(), output=tmp_path, **options)

@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+from contextlib import closing
 
 import pytest
 import torch
@@ -11,8 +12,10 @@ from lerobot.envs.configs import PushtEnv
 from lerobot.policies import make_pre_post_processors
 
 from lerobot_agpd.cli import report as command
+from lerobot_agpd.config import FlagError
+from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
 from lerobot_agpd.policies.agpd_diffusion.modeling_agpd_diffusion import AGPDDiffusionPolicy
-from lerobot_agpd.studies.evaluation import Checkpoint, Environments
+from lerobot_agpd.studies.evaluation import Evaluator
 
 pytest.importorskip("gym_pusht")
 
@@ -51,24 +54,20 @@ def test_one_row_per_policy_and_number_of_executed_steps(monkeypatch, tmp_path, 
 
 
 @pytest.mark.parametrize(("n_action_steps", "predictions"), [(None, 3), (4, 3), (2, 6), (1, 12)])
-def test_the_policy_predicts_as_often_as_asked(student, n_action_steps, predictions):
+def test_the_policy_predicts_as_often_as_asked(monkeypatch, tmp_path, student, n_action_steps, predictions):
     """In an episode of 12 steps."""
-    checkpoint, calls = Checkpoint(student, "cpu", n_action_steps), []
-    checkpoint.policy.model.register_forward_hook(lambda *_: calls.append(1))
+    calls, predict = [], AGPDPolicy.predict_action_chunk
+    monkeypatch.setattr(
+        AGPDPolicy, "predict_action_chunk", lambda self, batch: calls.append(1) or predict(self, batch)
+    )
     config = PushtEnv(obs_type="environment_state_agent_pos", episode_length=12)
-    with Environments(config, n_envs=1) as environments:
-        checkpoint.evaluate(environments, 1, 100_000)
+    with closing(Evaluator(config, 1, tmp_path, "cpu")) as evaluator:
+        evaluator.evaluate(student, 1, 100_000, n_action_steps)
     assert len(calls) == predictions
 
 
-@pytest.mark.parametrize("n_action_steps", [0, 5])
-def test_impossible_numbers_of_executed_steps_are_refused(student, n_action_steps):
-    with pytest.raises(ValueError, match=f"n_action_steps={n_action_steps}: .* was trained to execute 4"):
-        Checkpoint(student, "cpu", n_action_steps)
-
-
 def test_nothing_to_report_and_missing_folders_are_named(tmp_path):
-    with pytest.raises(ValueError, match="--runs='{name: folder}'"):
+    with pytest.raises(FlagError, match="--runs='{name: folder}'"):
         command.ReportConfig(env=PushtEnv(), output=tmp_path)
     with pytest.raises(FileNotFoundError, match="'a': .*missing does not exist"):
         command.ReportConfig(env=PushtEnv(), output=tmp_path, policies={"a": tmp_path / "missing"})
@@ -82,10 +81,11 @@ def test_nothing_to_report_and_missing_folders_are_named(tmp_path):
         ({"batch_size": 0}, "--batch_size"),
         ({"seed": 1000}, "--seed=1000: .*training and collection never use"),
         ({"n_action_steps": [4, 5]}, "n_action_steps=5: .* was trained to execute 4"),
+        ({"n_action_steps": [0]}, "n_action_steps=0: .* was trained to execute 4"),
     ],
 )
 def test_what_cannot_work_is_refused_before_anything_is_evaluated(tmp_path, student, options, flag):
-    with pytest.raises(ValueError, match=flag):
+    with pytest.raises(FlagError, match=flag):
         command.ReportConfig(env=PushtEnv(), output=tmp_path, policies={"a": student}, **options)
 
 
@@ -104,12 +104,12 @@ def test_a_policy_that_samples_does_so_reproducibly(tmp_path, agpd_diffusion_con
     for processor in make_pre_post_processors(config, dataset_stats=stats):
         processor.save_pretrained(tmp_path)
     env = PushtEnv(obs_type="environment_state_agent_pos", episode_length=12)
-    found = []
-    for _ in range(2):
+    evaluations = []
+    for folder in ("a", "b"):
         torch.rand(3)
-        with Environments(env, n_envs=2) as environments:
-            found.append(Checkpoint(tmp_path, "cpu").evaluate(environments, 2, 100_000))
-    assert found[0] == found[1]
+        with closing(Evaluator(env, 2, tmp_path / folder, "cpu")) as evaluator:
+            evaluations.append(evaluator.evaluate(tmp_path, 2, 100_000))
+    assert evaluations[0] == evaluations[1]
 
 
 def test_finished_evaluations_are_written_before_one_fails(monkeypatch, tmp_path, student):
@@ -137,7 +137,7 @@ def test_a_second_report_reuses_the_evaluations(monkeypatch, tmp_path, student):
     def refuse(self, *arguments):
         raise AssertionError("evaluated again")
 
-    monkeypatch.setattr(Checkpoint, "evaluate", refuse)
+    monkeypatch.setattr(Evaluator, "_roll_out", refuse)
     again = reported(monkeypatch, tmp_path / "out", policies)
     assert again["student"]["final"] == rows["student"]["final"]
     with pytest.raises(AssertionError, match="evaluated again"):

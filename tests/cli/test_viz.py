@@ -1,6 +1,5 @@
 """`lerobot-agpd-viz`, end to end on Push-T with random policies."""
 
-import json
 import sys
 from pathlib import Path
 
@@ -12,8 +11,11 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
 from lerobot_agpd.cli import viz
-from lerobot_agpd.distill.loading import load_student
-from lerobot_agpd.guidance.config import TeacherConfig
+from lerobot_agpd.config import FlagError, TeacherConfig
+from lerobot_agpd.files import write_json
+from lerobot_agpd.loading import load_student
+from lerobot_agpd.progress import Progress
+from lerobot_agpd.rollout.report import RoundReport
 
 pytest.importorskip("gym_pusht")
 RrdReader = pytest.importorskip("rerun.experimental").RrdReader
@@ -35,7 +37,7 @@ def make_config(monkeypatch, student: Path, **options) -> viz.VizConfig:
 
 
 def rollouts(config: viz.VizConfig, scale: float) -> list:
-    return list(viz.record_rollouts(config, viz.make_guided_teacher(config), scale))
+    return list(viz.record_rollouts(config, viz.make_guided_strategy(config), scale))
 
 
 def test_command_writes_recording_and_picture(monkeypatch, student, tmp_path):
@@ -57,11 +59,12 @@ def test_command_writes_recording_and_picture(monkeypatch, student, tmp_path):
 
 def test_decisions_and_frames_belong_to_the_steps(monkeypatch, student):
     config = make_config(monkeypatch, student, episodes=2, seed=100_003)
-    for number, (episode, rollout) in enumerate(rollouts(config, scale=2.0)):
-        assert episode.ticket.seed == 100_003 + number
+    for number, rollout in enumerate(rollouts(config, scale=2.0)):
+        episode = rollout.episode
+        assert episode.spec.seed == 100_003 + number
         assert len(rollout.frames) == len(episode) == EPISODE_LENGTH
         assert [decision.step for decision in rollout.decisions] == [0, 4, 8]
-        executed = np.concatenate([decision.chunks.guided for decision in rollout.decisions])
+        executed = np.concatenate([decision.chunks["guided"] for decision in rollout.decisions])
         np.testing.assert_array_equal(executed[:EPISODE_LENGTH], episode.actions)
         # The frame shows the agent (royal blue) where the observation of the same step says it is.
         for step in (0, 5, 9):
@@ -75,15 +78,15 @@ def test_guidance_pulls_toward_the_student_from_the_same_noise(
 ):
     student = student_of(tmp_path / "student", teacher, representation)
     config = make_config(monkeypatch, student, render=False)
-    ((_, unguided),) = rollouts(config, scale=0.0)
-    ((_, guided),) = rollouts(config, scale=50.0)
+    (unguided,) = rollouts(config, scale=0.0)
+    (guided,) = rollouts(config, scale=50.0)
     assert not guided.frames
     for decision in unguided.decisions:
-        np.testing.assert_array_equal(decision.chunks.guided, decision.chunks.teacher)
+        np.testing.assert_array_equal(decision.chunks["guided"], decision.chunks["teacher"])
     first = guided.decisions[0]
-    np.testing.assert_array_equal(first.chunks.teacher, unguided.decisions[0].chunks.teacher)
-    np.testing.assert_array_equal(first.chunks.student, unguided.decisions[0].chunks.student)
-    assert np.abs(first.chunks.guided - first.chunks.teacher).max() > 0
+    np.testing.assert_array_equal(first.chunks["teacher"], unguided.decisions[0].chunks["teacher"])
+    np.testing.assert_array_equal(first.chunks["student"], unguided.decisions[0].chunks["student"])
+    assert np.abs(first.chunks["guided"] - first.chunks["teacher"]).max() > 0
     assert np.isfinite(first.guidance_shift)
     if representation == "action":
         assert all(
@@ -93,33 +96,36 @@ def test_guidance_pulls_toward_the_student_from_the_same_noise(
 
 def test_student_chunk_is_what_the_policy_executes(monkeypatch, student):
     config = make_config(monkeypatch, student, render=False)
-    ((episode, rollout),) = rollouts(config, scale=0.0)
+    (rollout,) = rollouts(config, scale=0.0)
     loaded = load_student(config.policy)
     preprocessor, postprocessor = make_pre_post_processors(config.policy, pretrained_path=str(student))
-    observation = {key: torch.from_numpy(episode.observations[key][0]) for key in (OBS_STATE, OBS_ENV_STATE)}
+    observation = {
+        key: torch.from_numpy(rollout.episode.observations[key][0]) for key in (OBS_STATE, OBS_ENV_STATE)
+    }
     chunk = loaded.student.predict_action_chunk(preprocessor(observation))[:, :N_STEPS]
-    np.testing.assert_allclose(rollout.decisions[0].chunks.student, postprocessor(chunk)[0], rtol=1e-5)
+    np.testing.assert_allclose(rollout.decisions[0].chunks["student"], postprocessor(chunk)[0], rtol=1e-5)
 
 
 def test_scale_is_given_or_the_runs_or_the_policys(monkeypatch, student, tmp_path):
     assert viz.guidance_scale(make_config(monkeypatch, student, scale=0.25)) == 0.25
     assert viz.guidance_scale(make_config(monkeypatch, student)) == 2.0
-    (student / "agpd_state.json").write_text(json.dumps({"updates": 10, "rounds": 2}))
+    Progress(step=10, rounds=2).save(student)
     assert viz.guidance_scale(make_config(monkeypatch, student)) == 2.0  # the rounds are gone
     for number, scale in enumerate((3.0, 6.0, 12.0)):  # the last one is newer than the checkpoint
-        folder = tmp_path / f"run/agpd/round-{number:03d}"
+        folder = tmp_path / f"run/agpd/round-{number:05d}"
         folder.mkdir(parents=True)
-        (folder / "round.json").write_text(json.dumps({"next_scale": scale}))
+        facts = {"round": number, "strength": 1.0, "next_scale": scale, "step": 10}
+        write_json(folder / "report.json", RoundReport.of([], **facts).to_json())
     assert viz.guidance_scale(make_config(monkeypatch, student)) == 6.0
 
 
 def test_teacher_flags_override_the_checkpoints(monkeypatch, student, teacher):
     config = make_config(monkeypatch, student, teacher=TeacherConfig(num_inference_steps=3))
-    guided = viz.make_guided_teacher(config)
+    guided = viz.make_guided_strategy(config)
     assert guided.pair.teacher.policy.diffusion.num_inference_steps == 3
     config = make_config(monkeypatch, student, teacher=TeacherConfig(path="nowhere/to/be/found"))
     with pytest.raises(FileNotFoundError, match="nowhere/to/be/found"):
-        viz.make_guided_teacher(config)
+        viz.make_guided_strategy(config)
 
 
 def test_failing_renderer_names_the_remedies(monkeypatch, student):
@@ -136,12 +142,12 @@ def test_failing_renderer_names_the_remedies(monkeypatch, student):
 
 
 def test_wrong_options_are_refused(monkeypatch, student, teacher):
-    with pytest.raises(ValueError, match="--episodes"):
+    with pytest.raises(FlagError, match="--episodes"):
         make_config(monkeypatch, student, episodes=0)
-    with pytest.raises(ValueError, match="--scale"):
+    with pytest.raises(FlagError, match="--scale"):
         make_config(monkeypatch, student, scale=-1.0)
-    with pytest.raises(ValueError, match="has no teacher"):
+    with pytest.raises(FlagError, match="has no teacher"):
         make_config(monkeypatch, teacher)
     monkeypatch.setattr(sys, "argv", ["lerobot-agpd-viz"])
-    with pytest.raises(ValueError, match=r"--policy\.path is not set"):
+    with pytest.raises(FlagError, match=r"--policy\.path is not set"):
         viz.VizConfig(env=PushtEnv())

@@ -32,6 +32,7 @@ from lerobot_agpd.loading import (
     require_student,
 )
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
+from lerobot_agpd.weights import not_finite_weight
 
 VISION = {"crop_shape": None, "pretrained_backbone_weights": None, **DIFFUSION}
 
@@ -77,6 +78,46 @@ def test_a_loaded_act_teacher_samples_as_before(act_path):
     teacher, act = load_teacher(TeacherConfig(path=act_path), "cpu"), make_teacher("act", WITH_CAMERA, **ACT)
     assert type(teacher) is ChunkTeacher
     torch.testing.assert_close(teacher.sample(history(WITH_CAMERA)), act.sample(history(WITH_CAMERA)))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_teacher_with_weights_that_are_not_finite(tmp_path, value):
+    policy, *processors = make_policy("act", WITH_CAMERA, **ACT)
+    name, parameter = list(policy.named_parameters())[-1]
+    with torch.no_grad():
+        parameter[0] = value
+    for part in (policy, *processors):
+        part.save_pretrained(tmp_path)
+    with pytest.raises(FlagError, match=rf"--policy.teacher.path='{tmp_path}': {name} is not finite"):
+        load_teacher(TeacherConfig(path=str(tmp_path)), "cpu")
+
+
+def test_a_teacher_with_statistics_that_are_not_finite(tmp_path):
+    policy, *processors = make_policy("act", WITH_CAMERA, **ACT)
+    policy.save_pretrained(tmp_path)
+    for processor in processors:
+        for step in processor.steps:
+            if stats := getattr(step, "_tensor_stats", None):
+                stats["action"]["std"][1] = float("nan")
+        processor.save_pretrained(tmp_path)
+    with pytest.raises(FlagError, match="'std' of 'action' is not finite"):
+        load_teacher(TeacherConfig(path=str(tmp_path)), "cpu")
+
+
+def test_a_mask_of_infinite_values_is_no_broken_weight():
+    model = torch.nn.Linear(2, 2)
+    model.register_buffer("mask", torch.tensor([0.0, -float("inf")]))
+    assert not_finite_weight(model) is None
+    model.mask[0] = float("nan")
+    assert not_finite_weight(model) == "mask"
+
+
+def test_chunks_that_are_not_finite_are_refused_when_sampled(act_path):
+    teacher, raw = load_teacher(TeacherConfig(path=act_path), "cpu"), history(WITH_CAMERA)
+    teacher.sample(raw)
+    raw[STATE][1] = float("nan")
+    with pytest.raises(FloatingPointError, match="'act' teacher.*--policy.teacher.path"):
+        teacher.sample(raw)
 
 
 def test_settings_of_the_sampler_act(diffusion_path):

@@ -206,6 +206,40 @@ def test_episodes_of_another_run_are_not_adopted(build, guided_config, tmp_path)
     assert build(elsewhere).agpd.journal.root == tmp_path / "x" != first.agpd.journal.root
 
 
+OTHER_EPISODES = [
+    ({"guidance": GuidanceConfig(at="mu")}, "guidance.at 'x0' instead of 'mu'"),
+    ({"collect": collect(min_reward=0.5)}, "collect.min_reward None instead of 0.5"),
+    ({"collect": collect(keep_failures=True)}, "collect.keep_failures False instead of True"),
+    ({"collect": collect(n_action_steps=2)}, "collect.n_action_steps None instead of 2"),
+]
+
+
+@pytest.mark.parametrize(("options", "difference"), OTHER_EPISODES)
+def test_episodes_made_with_other_settings_are_not_adopted(build, guided_config, options, difference):
+    build(guided_config())
+    with pytest.raises(ValueError, match=f"another run.*{difference}.*--policy.replay.root"):
+        build(guided_config(**options))
+
+
+def test_episodes_of_another_sampler_are_not_adopted(build, guided_config):
+    config = guided_config()
+    build(config)
+    config.teacher.num_inference_steps = 3
+    with pytest.raises(ValueError, match="teacher.num_inference_steps None instead of 3"):
+        build(config)
+
+
+@pytest.mark.parametrize("changed", [False, True])
+def test_a_resumed_run_with_other_settings_warns(build, guided_config, tmp_path, caplog, changed):
+    folder = tmp_path / "run" / "checkpoints" / "000001" / "pretrained_model"
+    build(guided_config()).save_pretrained(folder)
+    config = guided_config(**({"collect": collect(min_reward=0.5)} if changed else {}))
+    config.pretrained_path = folder
+    build(config, resume=True)
+    warnings = [record.getMessage() for record in caplog.records if "other settings" in record.getMessage()]
+    assert ["collect.min_reward None instead of 0.5" in warning for warning in warnings] == [True] * changed
+
+
 @pytest.mark.parametrize(
     ("state", "error", "message"),
     [

@@ -88,3 +88,45 @@ def test_held_out_losses_have_neither_adversary_nor_relabeled_chunks(policy, loo
     assert "discriminator_loss" not in log and "action_is_pad" in recorded
     trained_on = policy.train().agpd.train_batch(batch)
     assert torch.isfinite(loss) and not torch.equal(trained_on["action"], recorded["action"])
+
+
+# ---- training that has become NaN ----
+
+
+@pytest.mark.parametrize(
+    ("part", "loss"),
+    [
+        ("model", "imitation_loss"),
+        ("discriminator", "discriminator_loss"),
+        ("representation", "representation_loss"),
+    ],
+)
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_loss_that_is_not_finite_stops_the_run(policy, loop_batch, part, loss, value):
+    batch = loop_batch(policy.config, range(13))
+    train(policy, batch, 4)
+    with torch.no_grad():
+        next(getattr(policy, part).parameters()).fill_(value)
+    with pytest.raises(FloatingPointError, match=rf"training step 5: .*{loss}.*weight {part}\.") as stop:
+        policy.forward(batch)
+    assert ("imitation_loss" in str(stop.value)) == (part == "model")
+
+
+def test_an_update_that_makes_weights_nan_stops_before_a_checkpoint_is_written(policy, loop_batch):
+    """LeRobot saves behind `update`; no forward pass has met these weights yet."""
+    batch = loop_batch(policy.config, range(13))
+    train(policy, batch, 2)
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=1e-3)
+    (policy.forward(batch)[0] * float("nan")).backward()
+    optimizer.step()
+    with pytest.raises(FloatingPointError, match="training step 3 .*weight"):
+        policy.update()
+
+
+def test_a_gradient_scaler_may_skip_an_update(policy, loop_batch):
+    batch = loop_batch(policy.config, range(13))
+    (policy.forward(batch)[0] * float("inf")).backward()
+    policy.zero_grad()
+    policy.update()
+    assert policy.agpd.progress.step == 1
+    train(policy, batch, 1)

@@ -4,6 +4,7 @@ import json
 import shutil
 from pathlib import Path
 
+import draccus
 import numpy as np
 import pytest
 from commands import (
@@ -18,6 +19,7 @@ from commands import (
     run_here,
 )
 from lerobot.configs import PreTrainedConfig
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import EnvConfig
 
@@ -124,3 +126,22 @@ def test_an_installed_teacher_without_a_command(tmp_path: Path, monkeypatch: pyt
     teacher.mkdir()
     (teacher / "config.json").write_text(json.dumps({"type": "stub", "device": "cpu"}))
     assert read_policy_config(teacher, "--policy.teacher.path").type == "stub"
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ("--env.type=pusht", "--env.obs_type=environment_state_agent_pos", "--env.render_mode=human"),
+        ("--env.type=aloha_state", "--env.obs_type=pixels_environment_state_agent_pos"),
+        ("--env.type=gymnasium_robotics", "--env.obs_type=state"),
+        ("--policy.type=multi_task_dit", "--policy.prediction_type=epsilon"),
+    ],
+    ids=lambda flags: flags[0],
+)
+def test_types_with_flags_of_the_same_name(flags: tuple[str, ...]) -> None:
+    """draccus holds a flag to the choices of the type that was registered last, whatever type is selected."""
+    config = draccus.parse(TrainPipelineConfig, args=["--dataset.repo_id=local/test", *flags])
+    _, *values = (flag.removeprefix("--").split("=") for flag in flags)
+    for name, value in values:
+        group, field = name.split(".")
+        assert getattr(getattr(config, group), field) == value

@@ -1,41 +1,18 @@
-"""The environment type `aloha_state` against gym_aloha, and as LeRobot's own commands use it."""
+"""The environment type `aloha_state` against gym_aloha."""
 
-import pickle
-import sys
-import warnings
-from dataclasses import dataclass
-from typing import get_args
-
-import draccus
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
-from lerobot.envs import EnvConfig, make_env, preprocess_observation
+from lerobot.envs import preprocess_observation
 from lerobot.envs.utils import env_to_policy_features
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import ACTION
 
-from lerobot_agpd.envs.aloha import ALOHA_TASKS, OBSERVED_KEYS, AlohaStateEnvConfig, Camera, ObsType, Task
+from lerobot_agpd.envs.aloha import CAMERAS, AlohaStateEnvConfig
 from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS
 
 gym_aloha = pytest.importorskip("gym_aloha")
 START = np.array([0, -0.96, 1.16, 0, -0.3, 0, 0.1] * 2, dtype=np.float32)
 SMALL = {"observation_height": 24, "observation_width": 32, "shadows": False}
-
-
-@dataclass
-class Command:
-    """Options of a command with an environment, such as `lerobot-eval`."""
-
-    env: EnvConfig
-
-
-@pytest.mark.parametrize("task", ALOHA_TASKS)
-def test_gymnasium_env_checker_accepts_it(task):
-    (env,) = make_env(AlohaStateEnvConfig(task=task))["aloha_state"][0].envs
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # unbounded observations, and being wrapped at all
-        check_env(env, skip_render_check=True)
 
 
 @pytest.mark.parametrize(("task", "n_objects"), [("AlohaTransferCube-v0", 1), ("AlohaInsertion-v0", 2)])
@@ -95,25 +72,6 @@ def test_cube_between_the_left_fingers_in_the_air_is_a_success():
     assert (reward, terminated, info["is_success"]) == (4.0, True, True)
 
 
-@pytest.mark.parametrize("use_async_envs", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_vector_env_agrees_with_the_declared_features(use_async_envs):
-    config = AlohaStateEnvConfig(episode_length=2)
-    env = make_env(config, n_envs=2, use_async_envs=use_async_envs)["aloha_state"][0]
-    try:
-        assert env.call("_max_episode_steps") == (2, 2)
-        assert env.call("task_description")[0].startswith("Pick up the cube")
-        observation, _ = env.reset(seed=[5, 6])
-        features = env_to_policy_features(config)
-        batch = preprocess_observation(observation)
-        assert set(batch) == {OBS_STATE, OBS_ENV_STATE} == set(features) - {ACTION}
-        assert all(tuple(batch[key].shape[1:]) == features[key].shape for key in batch)
-        env.step(np.stack([START, START]))
-        _, _, _, truncated, info = env.step(np.stack([START, START]))
-        assert truncated.all() and info["final_info"]["is_success"].tolist() == [False, False]
-    finally:
-        env.close()
-
-
 def test_images_come_from_the_chosen_cameras_in_the_chosen_size(rendering):
     config = AlohaStateEnvConfig(obs_type="pixels_agent_pos", cameras=["top", "left_wrist"], **SMALL)
     env = config.make_single()
@@ -142,41 +100,4 @@ def test_the_state_is_at_hand_whatever_is_observed(rendering, obs_type):
 
 def test_the_cameras_are_the_models():
     model = AlohaStateEnvConfig().make_single().unwrapped._env.physics.model
-    assert set(get_args(Camera)) == {model.id2name(camera, "camera") for camera in range(model.ncam)}
-
-
-def test_choices_are_those_of_the_tables():
-    assert get_args(Task) == tuple(ALOHA_TASKS)
-    assert get_args(ObsType) == tuple(OBSERVED_KEYS)
-
-
-def test_command_line_and_round_trip():
-    argv = ["--env.type=aloha_state", "--env.task=AlohaInsertion-v0", "--env.cameras=[angle]"]
-    config = draccus.parse(Command, args=argv).env
-    assert isinstance(config, AlohaStateEnvConfig) and config.cameras == ["angle"]
-    assert draccus.decode(EnvConfig, draccus.encode(config, EnvConfig)) == config
-    assert pickle.loads(pickle.dumps(config)) == config
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"task": "AlohaLaundry-v0"}, "AlohaLaundry-v0"),
-        ({"obs_type": "state"}, "obs_type must be one of environment_state_agent_pos"),
-        ({"cameras": ["behind"]}, "behind.*must name at least one of top"),
-        ({"cameras": []}, "at least one of top"),
-        ({"fps": 30}, "fps=30.*50 steps per second"),
-        ({"render_mode": "human"}, "render_mode=human"),
-        ({"episode_length": 0}, "episode_length"),
-        ({"observation_height": 3}, "observation_height=3"),
-    ],
-)
-def test_what_it_cannot_do_is_refused(options, message):
-    with pytest.raises(ValueError, match=message):
-        AlohaStateEnvConfig(**options)
-
-
-def test_missing_package_names_the_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "gym_aloha", None)
-    with pytest.raises(ModuleNotFoundError, match=r"pip install 'lerobot_policy_agpd\[aloha\]'"):
-        make_env(AlohaStateEnvConfig())
+    assert set(CAMERAS) == {model.id2name(camera, "camera") for camera in range(model.ncam)}

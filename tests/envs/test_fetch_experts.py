@@ -111,10 +111,10 @@ def test_push_stages():
 @given(data=st.data())
 def test_any_observation_gets_a_valid_action_and_always_the_same(task, data):
     numbers = st.floats(-3, 3, width=32)
-    layout = TASKS[task].layout
+    spec = TASKS[task]
     observation = {
-        AGENT_POS: data.draw(arrays(np.float32, layout.agent_pos_dim, elements=numbers)),
-        ENVIRONMENT_STATE: data.draw(arrays(np.float32, layout.environment_state_dim, elements=numbers)),
+        AGENT_POS: data.draw(arrays(np.float32, spec.agent_pos_dim, elements=numbers)),
+        ENVIRONMENT_STATE: data.draw(arrays(np.float32, spec.environment_state_dim, elements=numbers)),
     }
     before = {key: value.copy() for key, value in observation.items()}
     action = EXPERTS[task](observation)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from lerobot_agpd.cli.demos import DemosConfig
+from lerobot_agpd.config import FlagError
 from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS
 from lerobot_agpd.envs.experts.point_maze import EXPERTS, WaysExpert
 from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
@@ -124,10 +125,10 @@ def test_fractions_of_the_ways(tmp_path):
 
 @pytest.mark.parametrize("ways", [[0.5, 0.5], [0.5, 0.5, 0.5], [-0.5, 0.5, 1.0]])
 def test_impossible_fractions_are_refused(ways, tmp_path):
-    with pytest.raises(ValueError, match=r"--ways=\["):
+    with pytest.raises(FlagError, match=r"--ways=\["):
         DemosConfig(tmp_path / "new", PointMazeWaysEnv(task="ThreeExits-v0"), ways=ways)
 
 
 def test_ways_of_a_task_that_has_one_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="--ways=.*FetchReach-v4"):
+    with pytest.raises(FlagError, match="--ways=.*FetchReach-v4"):
         DemosConfig(tmp_path / "new", GymnasiumRoboticsEnv(task="FetchReach-v4"), ways=[1.0])

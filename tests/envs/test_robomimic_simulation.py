@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS
+from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS, View
 from lerobot_agpd.envs.robomimic_tasks import TASKS
 
 pytest.importorskip("robosuite")
 
-from lerobot_agpd.envs.robosuite_sim import RobosuiteEnv, View  # noqa: E402
+from lerobot_agpd.envs.robosuite_sim import RobosuiteEnv  # noqa: E402
 
 ALL_TASKS = [pytest.param(t, marks=() if t == "lift" else pytest.mark.slow) for t in TASKS]
 
@@ -205,7 +205,7 @@ def test_states_are_seen_whatever_is_observed_and_no_renderer_is_opened_for_them
     env = make("lift")
     roll(env, 0)
     assert set(env.state) == {AGENT_POS, ENVIRONMENT_STATE}
-    assert not env.scene_renderer.is_open
+    assert not env.scene_renderer.renderers
     assert env.simulation.sim._render_context_offscreen is None
 
 
@@ -221,7 +221,7 @@ def test_robosuites_warnings_are_silenced_but_not_its_errors(caplog):
 def test_images_are_robosuites_turned_the_right_way_up(rendering):
     from robosuite.utils.binding_utils import MjRenderContextOffscreen
 
-    view = View("pixels_agent_pos", ("agentview", "robot0_eye_in_hand"), (40, 56), (48, 64))
+    view = View((AGENT_POS, PIXELS), ("agentview", "robot0_eye_in_hand"), (40, 56), (48, 64))
     env = RobosuiteEnv("lift", view)
     observation, _ = env.reset(seed=1)
     assert list(observation) == [AGENT_POS, PIXELS]
@@ -241,7 +241,7 @@ def test_images_are_robosuites_turned_the_right_way_up(rendering):
 
 @pytest.mark.slow
 def test_space_of_the_images():
-    env = RobosuiteEnv("lift", View("pixels", ("sideview",), (24, 32)))
+    env = RobosuiteEnv("lift", View((PIXELS,), ("sideview",), (24, 32)))
     assert isinstance(env.observation_space[PIXELS], gym.spaces.Dict)
     assert env.observation_space[PIXELS]["sideview"].shape == (24, 32, 3)
     env.close()

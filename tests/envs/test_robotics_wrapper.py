@@ -29,7 +29,7 @@ def test_no_renderer_is_opened_unless_asked_for():
     env = GymnasiumRoboticsEnv(**REACH).make_single()
     env.reset(seed=0)
     env.step(np.zeros(4, dtype=np.float32))
-    assert not env.scene_renderer.is_open
+    assert not env.scene_renderer.renderers
     assert env.unwrapped.mujoco_renderer.viewer is None
 
 

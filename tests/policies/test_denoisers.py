@@ -84,7 +84,7 @@ def test_without_the_causal_mask_every_action_sees_every_other():
 
 
 def test_order_matters():
-    """Only the learnt positions tell two condition tokens apart."""
+    """Only the learned positions tell two condition tokens apart."""
     net = transformer(causal=False)
     x, k, condition = inputs()
     exchanged = condition.view(B, C, D)[:, [1, 0, 2]].flatten(1)

@@ -114,3 +114,12 @@ def test_one_feature_that_does_not_match_is_enough_to_refuse():
     delivered["action"] = delivered["action"] * 1.05 + 0.05
     with pytest.raises(ValueError, match="no known statistics.*'one'.*'other'"):
         matching_normalizer(config(), [("one", ONE), ("other", OTHER)], raw, delivered)
+
+
+@pytest.mark.parametrize("key", [KEY, "action"])
+def test_one_nan_matches_no_statistics(key):
+    raw = {KEY: torch.randn(8, 2), "action": torch.randn(8, 2)}
+    delivered = {name: Normalizer(config(), ONE).normalize(name, values) for name, values in raw.items()}
+    delivered[key][3, 1] = float("nan")
+    with pytest.raises(ValueError, match="no known statistics"):
+        matching_normalizer(config(), [("one", ONE)], raw, delivered)

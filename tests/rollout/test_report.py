@@ -1,4 +1,5 @@
 import json
+import logging
 import math
 from dataclasses import replace
 
@@ -82,6 +83,30 @@ def test_failed_starts_that_are_tried_again_are_counted_apart():
     assert made.total.generated == 10 and made.total.kept == 4
 
 
+def test_invalid_episodes_are_counted_apart():
+    """Neither the strategy nor the teacher answers for what the environment delivers."""
+    broken = [record(success=False, invalid="'next.reward' at step 3", max_reward=math.nan) for _ in range(2)]
+    made = report([*broken, *RECORDS])
+    assert made.total == Tally(generated=9, solved_at_start=2, successful=3, kept=3, invalid=2)
+    assert made.strategy.invalid == 2
+    assert success_rate([made.strategy]) == success_rate([report(RECORDS).strategy])
+    assert made.mean_max_reward == report(RECORDS).mean_max_reward
+    assert RoundReport.from_json(json.loads(json.dumps(made.to_json(), allow_nan=False))) == made
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("name", ["max_reward", "discrepancy", "guidance_shift"])
+def test_a_record_with_an_unknown_number_is_json(name, value):
+    made = record(
+        success=False,
+        invalid="'action' at step 0",
+        **{"discrepancy": 0.0, "guidance_shift": 0.0, name: value},
+    )
+    restored = EpisodeRecord.from_json(json.loads(json.dumps(made.to_json(), allow_nan=False)))
+    assert math.isnan(getattr(restored, name))
+    assert replace(restored, **{name: 0.0}) == replace(made, **{name: 0.0})
+
+
 def test_reports_and_records_survive_json():
     measured = RoundDiagnostics({"rms_to_student": 1.0}, {"entropy": None, "coverage": 0.5}, seconds=2.0)
     made = report(RECORDS, seconds={"teacher": 1.5}, diagnostics=measured)
@@ -113,6 +138,6 @@ def test_what_the_training_log_says():
 
 def test_a_round_without_a_kept_episode_is_warned_of(caplog):
     log_round(report(RECORDS))
-    assert not caplog.records
+    assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
     log_round(report([record(success=False)]))
     assert "--policy.collect.min_reward" in caplog.text

@@ -96,8 +96,8 @@ def test_a_students_fraction_hangs_on_the_episodes_own_seed():
     assert [spec.student_fraction for spec in small] == [spec.student_fraction for spec in large[:5]]
 
 
-def record(seed, success=False, solved_at_start=False) -> EpisodeRecord:
-    facts = {"strength": 0.0, "length": 1, "max_reward": 0.0, "is_success": None, "kept": success}
+def record(seed, success=False, solved_at_start=False, **options) -> EpisodeRecord:
+    facts = {"strength": 0.0, "length": 1, "max_reward": 0.0, "is_success": None, "kept": success, **options}
     return EpisodeRecord(number=0, seed=seed, success=success, solved_at_start=solved_at_start, **facts)
 
 
@@ -107,6 +107,7 @@ def test_failed_starts_by_hand():
     second = [record(2), record(3, success=True), record(5)]
     assert failed_starts([*first, *second, record(6)]) == [5, 6, 2]
     assert failed_starts([]) == []
+    assert failed_starts([record(1, invalid="'action' at step 0")]) == [], "the environment failed there"
 
 
 def test_retries_take_the_first_places_of_the_strategy():

@@ -78,3 +78,16 @@ def test_what_the_student_finishes_alone_is_counted_and_not_kept(keep_failures):
 def test_an_environment_that_does_not_report_success_is_refused():
     with pytest.raises(ValueError, match="is_success.*--policy.collect.min_reward"):
         classify(episode([0.0, 1.0]), CollectConfig())
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("key", ["observation.state", "action", "next.reward"])
+@pytest.mark.parametrize("config", [CollectConfig(keep_failures=True), CollectConfig(min_reward=0.5)])
+def test_an_episode_with_a_number_that_is_not_finite_is_dropped(key, value, config):
+    valid = episode([0.0, 2.0, 1.0], [0, 0, 1])
+    valid.observations["observation.state"] = np.zeros((3, 2), dtype=np.float32)
+    assert classify(valid, config).kept and classify(valid, config).invalid is None
+    valid.columns[key][1] = value
+    record = classify(valid, config)
+    assert (record.success, record.kept) == (False, False)
+    assert record.invalid == f"'{key}' at step 1"

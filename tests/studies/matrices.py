@@ -1,4 +1,4 @@
-"""A small comparison: its YAML and evaluations with known outcomes."""
+"""A small comparison: its YAML, evaluations with known outcomes and reports of rounds."""
 
 from pathlib import Path
 
@@ -57,3 +57,36 @@ def evaluation(successes, seed=100_000) -> Evaluation:
         max_rewards=[0.5 * value for value in map(float, successes)],
         seeds=list(range(seed, seed + len(successes))),
     )
+
+
+def tally(generated, successful, kept, solved_at_start=0) -> dict:
+    return {
+        "generated": generated,
+        "solved_at_start": solved_at_start,
+        "successful": successful,
+        "kept": kept,
+    }
+
+
+def collected(strategy, teacher_only, actions=None, states=None, **changes) -> dict:
+    """A round's report; generated, successful and kept episodes of both parts, none of them solved at the start."""
+    return {
+        "round": 0,
+        "strength": 0.5,
+        "next_scale": 0.5,
+        "step": 10,
+        "total": tally(*(sum(counts) for counts in zip(strategy, teacher_only, strict=True))),
+        "strategy": tally(*strategy),
+        "teacher_only": tally(*teacher_only),
+        "retried": tally(0, 0, 0),
+        "student_alone": tally(0, 0, 0),
+        "kept_frames": 0,
+        "mean_max_reward": None,
+        "mean_discrepancy": None,
+        "mean_discrepancy_teacher_only": None,
+        "mean_guidance_shift": 0.5,
+        "mean_student_steps": None,
+        "diagnostics": {"actions": actions, "states": states, "seconds": 0.0} if actions or states else None,
+        "seconds": {"teacher": 2.0, "environment": 1.0},
+        **changes,
+    }

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from lerobot_agpd.studies.diversity import (
+from lerobot_agpd.rollout.diversity import (
     Gaussian,
     gaussian_kl,
     knn_entropy,

@@ -1,10 +1,13 @@
 """Rerun recordings and stills of synthetic rollouts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import rerun as rr
 
-from lerobot_agpd.studies.recording import Chunks, DecisionRecord, RolloutRecord
+from lerobot_agpd.replay.episode import Episode, EpisodeSpec
+from lerobot_agpd.studies.recording import COLORS, DecisionRecord, RolloutRecord
 from lerobot_agpd.studies.rerun_log import TIMELINE, blueprint, layout, log_rollout
 from lerobot_agpd.studies.still import draw_still
 
@@ -19,9 +22,13 @@ def make_rollout(action_dim: int = 2, frames: bool = True, overlay: bool = True)
 
     def decision(step: int) -> DecisionRecord:
         chunks = rng.uniform(0, 100, size=(3, CHUNK, action_dim)).astype(np.float32)
-        return DecisionRecord(step, Chunks(*chunks), 2.0 + step, 1.0 + step, float("nan"))
+        return DecisionRecord(
+            step, dict(zip(COLORS, chunks, strict=True)), 2.0 + step, 1.0 + step, float("nan")
+        )
 
-    return RolloutRecord(
+    episode = Episode(
+        spec=EpisodeSpec(0, 0, 1.0),
+        task="",
         observations={
             "observation.state": rng.normal(size=(N_STEPS, 5)).astype(np.float32),
             "observation.images.top": rng.integers(0, 255, (N_STEPS, 16, 16, 3), dtype=np.uint8),
@@ -29,6 +36,9 @@ def make_rollout(action_dim: int = 2, frames: bool = True, overlay: bool = True)
         actions=rng.uniform(0, 100, size=(N_STEPS, action_dim)).astype(np.float32),
         rewards=np.linspace(0, 1, N_STEPS, dtype=np.float32),
         successes=np.arange(N_STEPS) >= 8,
+    )
+    return RolloutRecord(
+        episode=episode,
         decisions=[decision(step) for step in range(0, N_STEPS, CHUNK)],
         frames=list(rng.integers(0, 255, (N_STEPS, 32, 24, 3), dtype=np.uint8)) if frames else [],
         to_frame=(lambda actions: 2 * actions) if overlay else None,
@@ -57,10 +67,10 @@ def test_recording_holds_what_happened(tmp_path):
     rollout = make_rollout()
     entities = write(rollout, tmp_path / "a.rrd")
     for name, values in (
-        ("action", rollout.actions),
-        ("observation/state", rollout.observations["observation.state"]),
-        ("reward", rollout.rewards[:, None]),
-        ("success", rollout.successes[:, None]),
+        ("action", rollout.episode.actions),
+        ("observation/state", rollout.episode.observations["observation.state"]),
+        ("reward", rollout.episode.rewards[:, None]),
+        ("success", rollout.episode.successes[:, None]),
     ):
         steps, logged = series(entities[f"episode_0/{name}"])
         assert steps == list(range(N_STEPS))
@@ -74,7 +84,7 @@ def test_recording_holds_what_was_planned(tmp_path):
     rollout = make_rollout()
     entities = write(rollout, tmp_path / "a.rrd")
     for name in ("teacher", "guided", "student"):
-        chunks = np.concatenate([getattr(d.chunks, name) for d in rollout.decisions])
+        chunks = np.concatenate([d.chunks[name] for d in rollout.decisions])
         for dim in range(2):
             steps, logged = series(entities[f"episode_0/chunk/{dim}/{name}"])
             assert steps == list(range(3 * CHUNK))  # beyond the end of the episode
@@ -84,7 +94,7 @@ def test_recording_holds_what_was_planned(tmp_path):
         drawn = np.array([row[0] for row in strips["LineStrips2D:strips"]])
         np.testing.assert_allclose(drawn.reshape(-1, 2), 2 * chunks)
     points = np.array([row[0] for row in entities["episode_0/frame/executed"]["Points2D:positions"]])
-    np.testing.assert_allclose(points, 2 * rollout.actions)
+    np.testing.assert_allclose(points, 2 * rollout.episode.actions)
     steps, discrepancy = series(entities["episode_0/discrepancy"])
     assert steps == [0, 4, 8]
     np.testing.assert_array_equal(discrepancy, [[2, 1], [6, 5], [10, 9]])
@@ -98,24 +108,20 @@ def test_recording_comes_with_its_views(tmp_path):
 
 def test_neither_frames_nor_overlay_nor_success(tmp_path):
     rollout = make_rollout(action_dim=4, frames=False, overlay=False)
-    object.__setattr__(rollout, "successes", None)
+    rollout.episode.successes = None
     entities = write(rollout, tmp_path / "a.rrd")
     assert not [path for path in entities if path.startswith("episode_0/frame")]
     assert "episode_0/success" not in entities and "episode_0/chunk/3/student" in entities
 
 
-@pytest.mark.parametrize(
-    ("action_dim", "frames", "overlay"),
-    [(2, True, True), (2, False, True), (1, True, False), (5, False, False)],
-)
-def test_still_is_drawn(tmp_path, action_dim, frames, overlay):
+@pytest.mark.parametrize(("action_dim", "frames"), [(2, True), (1, True), (5, False)])
+def test_still_is_drawn(tmp_path, action_dim, frames):
     path = tmp_path / "still.png"
-    draw_still(make_rollout(action_dim, frames, overlay), path)
+    draw_still(make_rollout(action_dim, frames, overlay=action_dim == 2), path)
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
 def test_still_of_a_single_decision(tmp_path):
     rollout = make_rollout()
-    object.__setattr__(rollout, "decisions", rollout.decisions[:1])
-    draw_still(rollout, tmp_path / "still.png")
+    draw_still(replace(rollout, decisions=rollout.decisions[:1]), tmp_path / "still.png")
     assert (tmp_path / "still.png").stat().st_size > 0

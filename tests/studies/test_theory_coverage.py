@@ -64,9 +64,10 @@ def test_coverage_probability_is_what_sampling_finds(dim, sigma_test, offset):
 
 
 def test_bound_by_hand():
-    # c epsilon / sigma = 0.2, d = 2, a = 2: mass 0.04 e^-8, tail e^-2
+    # epsilon chosen for c epsilon / sigma = 0.2; d = 2, a = 2: mass 0.04 e^-8, tail e^-2
     expected = 1 - (1 - 0.04 * math.exp(-8)) ** 1000 - math.exp(-2)
-    assert coverage_bound(1.0, 0.2, 1000, 2, a=2.0, c=1.0) == pytest.approx(expected)
+    epsilon = 0.2 * math.sqrt(2 * math.pi)
+    assert coverage_bound(1.0, epsilon, 1000, 2, a=2.0) == pytest.approx(expected)
 
 
 @given(st.integers(1, 30), st.floats(-3, 3), st.floats(0, 6))

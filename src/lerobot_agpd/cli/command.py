@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import sys
 from argparse import ArgumentError
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import wraps
 from pathlib import Path
 from typing import get_type_hints
@@ -14,9 +14,12 @@ from typing import get_type_hints
 import draccus
 from draccus.utils import DraccusException
 from lerobot.configs import PreTrainedConfig, parser
+from lerobot.envs import EnvConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
+from lerobot_agpd.config import StudentConfig, TeacherConfig
+from lerobot_agpd.loading import require_student
 from lerobot_agpd.studies.parsing import load_plugins, reason
 
 logger = logging.getLogger(__name__)
@@ -24,44 +27,37 @@ logger = logging.getLogger(__name__)
 WRONG_INPUT = (ValueError, FileNotFoundError, FileExistsError, ModuleNotFoundError, ArgumentError)
 
 
-def entry_point[C](name: str) -> Callable[[Callable[[C], None]], Callable[[], None]]:
-    """Make a console entry point of a function whose only parameter is a dataclass of flags.
+def entry_point[C](name: str, positional: str = "") -> Callable[[Callable[[C], None]], Callable[[], None]]:
+    """Make a console entry point of a function whose parameter `config` is a dataclass of flags.
 
-    `--<field>.discover_packages_path=<package>` imports a package that registers types, as in LeRobot's commands, and
-    `--<field>.path` is left to the `__post_init__` of a dataclass that names the field in `__get_path_fields__`.
+    Wrong input ends the command with one line instead of a traceback. `--<field>.discover_packages_path=<package>`
+    imports a package that registers types, as in LeRobot's commands; `--<field>.path` is left to the `__post_init__`
+    of a dataclass that names the field in `__get_path_fields__`.
 
     Args:
         name: of the command, as error messages begin.
+        positional: flag whose name may be left out before the first word.
     """
 
     def decorate(function: Callable[[C], None]) -> Callable[[], None]:
         @wraps(function)
         def main() -> None:
-            (config_class,) = (kind for key, kind in get_type_hints(function).items() if key != "return")
-            with command(name):
-                function(_parse(config_class, sys.argv[1:]))
+            init_logging()
+            register_third_party_plugins()
+            try:
+                args = sys.argv[1:]
+                if positional and args and not args[0].startswith("-"):
+                    args[0] = f"--{positional}={args[0]}"
+                function(_parse(get_type_hints(function)["config"], args))
+            except DraccusException as error:  # hides the message of a `__post_init__`
+                sys.exit(f"{name}: {reason(error)}")
+            except WRONG_INPUT as error:
+                logger.debug("the traceback:", exc_info=True)
+                sys.exit(f"{name}: {error}")
 
         return main
 
     return decorate
-
-
-@contextmanager
-def command(name: str) -> Iterator[None]:
-    """Set up logging and plugins; wrong input ends the command with one line instead of a traceback.
-
-    Args:
-        name: of the command, as the line begins.
-    """
-    init_logging()
-    register_third_party_plugins()
-    try:
-        yield
-    except DraccusException as error:  # hides the message of a `__post_init__`
-        sys.exit(f"{name}: {reason(error)}")
-    except WRONG_INPUT as error:
-        logger.debug("the traceback:", exc_info=True)
-        sys.exit(f"{name}: {error}")
 
 
 def _parse[C](config_class: type[C], args: list[str]) -> C:
@@ -79,12 +75,36 @@ def _parse[C](config_class: type[C], args: list[str]) -> C:
     return draccus.parse(config_class=config_class, config_path=config_path, args=args)
 
 
-def checkpoint_of_policy_flag() -> PreTrainedConfig | None:
-    """The configuration of `--policy.path=<checkpoint>` with the `--policy.*` flags beside it; None without a path."""
-    path = parser.get_path_arg("policy")
-    if not path:
-        return None
-    overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
-    config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
-    config.pretrained_path = Path(path)
-    return config
+@dataclass(kw_only=True)
+class StudentFlags:
+    """A student with the teacher that it was distilled from, and where they act."""
+
+    # Environment to act in.
+    env: EnvConfig
+    # The student: --policy.path=<checkpoint of a distilled policy>.
+    policy: PreTrainedConfig | None = None
+    # Flags that are not set are the checkpoint's.
+    teacher: TeacherConfig = field(default_factory=TeacherConfig)
+
+    def __post_init__(self) -> None:
+        """Read the checkpoint's configuration.
+
+        Raises:
+            FlagError: if there is no checkpoint, or it is of another policy.
+        """
+        path = parser.get_path_arg("policy")
+        if path:
+            overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
+            self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+            self.policy.pretrained_path = Path(path)
+        require_student(self.policy)
+
+    @classmethod
+    def __get_path_fields__(cls) -> list[str]:
+        """Fields whose `.path` the parser leaves to `__post_init__`."""
+        return ["policy"]
+
+    @property
+    def student(self) -> StudentConfig:
+        """The configuration of the student's checkpoint."""
+        return require_student(self.policy)

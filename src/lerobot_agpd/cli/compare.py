@@ -14,12 +14,13 @@ from lerobot_agpd.config import require
 from lerobot_agpd.studies.comparison import REPORT, Comparison, write_report
 from lerobot_agpd.studies.jobs import run_jobs
 from lerobot_agpd.studies.matrix import load_matrix
+from lerobot_agpd.studies.run_results import evaluate_run
 from lerobot_agpd.studies.runs import Run, check, expand
 from lerobot_agpd.studies.training import check_same_command
 
 logger = logging.getLogger(__name__)
 
-Phase = Literal["all", "train", "evaluate", "report"]
+Phase = Literal["all", "evaluate", "report"]
 
 
 @dataclass
@@ -30,7 +31,7 @@ class CompareConfig:
     matrix: Path
     # Folder of runs and report; default: the matrix's.
     output: Path | None = None
-    # A part of the work; a single run is evaluated in this process.
+    # A part of the work: evaluate, in this process, what is trained; or only write the report.
     only: Phase = "all"
     # Part of the matrix's tasks; default: all.
     tasks: list[str] = field(default_factory=list)
@@ -60,8 +61,7 @@ def load(config: CompareConfig) -> tuple[Comparison, list[Run]]:
         check(matrix, runs)
         for run in runs:
             check_same_command(run)
-    train, evaluate = config.only != "evaluate", config.only != "train"
-    return Comparison(config.matrix, matrix, train, evaluate, config.threads), runs
+    return Comparison(config.matrix, matrix, config.threads), runs
 
 
 @entry_point("lerobot-agpd-compare")
@@ -73,16 +73,17 @@ def main(config: CompareConfig) -> None:
         for run in runs:
             console.print(comparison.describe(run) + "\n", markup=False, highlight=False, soft_wrap=True)
         return
-    if config.only == "evaluate" and len(runs) == 1:
-        comparison.evaluate_here(runs[0])
+    if config.only == "evaluate":
+        for run in runs:
+            evaluate_run(comparison.matrix, run)
         return
     failures: dict[str, str] = {}
-    if config.only != "report":
+    if config.only == "all":
         waiting = [run for run in runs if comparison.needs_work(run)]
         logger.info("%d runs, %d of them finished", len(runs), len(runs) - len(waiting))
         jobs = [comparison.job(run) for run in waiting]
         failures = run_jobs(jobs, config.jobs, config.threads, console)
-    if config.only != "train" and len(failures) < len(runs):
+    if len(failures) < len(runs):
         console.print(Markdown(write_report(comparison.matrix)))
         logger.info("wrote %s, outcomes-*.png and curves-*.png to %s", REPORT, comparison.matrix.output)
     if failures:

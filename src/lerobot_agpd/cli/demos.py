@@ -11,7 +11,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import draccus
 from datasets import disable_progress_bars
 from lerobot.configs import FeatureType
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -21,11 +20,11 @@ from rich.console import Console
 from rich.table import Table
 from scipy.stats import binomtest
 
-from lerobot_agpd.cli.command import command
+from lerobot_agpd.cli.command import entry_point
 from lerobot_agpd.cli.progress import episode_bar
-from lerobot_agpd.config import EVALUATION_SEEDS
+from lerobot_agpd.config import EVALUATION_SEEDS, FlagError, require
 from lerobot_agpd.dataset_writer import DatasetWriter, flag, image, vector
-from lerobot_agpd.envs.base import SingleEnvConfig
+from lerobot_agpd.envs.base import SimulatedEnvConfig
 from lerobot_agpd.envs.demonstrations import SKILL, DemosReport, successful_episodes
 from lerobot_agpd.envs.experts import make_expert
 from lerobot_agpd.envs.experts.base import Expert
@@ -64,33 +63,34 @@ class DemosConfig:
         """Check the options.
 
         Raises:
-            ValueError: if the task has no expert, or an option is impossible.
-            FileExistsError: if `root` exists.
+            FlagError: if an option is impossible.
+            ValueError: if the task has no expert.
         """
         self.make_expert()
-        if not self.skills or not all(0 <= skill <= 1 for skill in self.skills):
-            raise ValueError(f"--skill={self.skill} must be one or several numbers in [0, 1].")
-        if self.episodes < 1:
-            raise ValueError(f"--episodes must be at least 1, got {self.episodes}.")
-        if self.seed < 0 or self.seed + self.episodes > EVALUATION_SEEDS[0]:
-            raise ValueError(
-                f"--seed={self.seed} with --episodes={self.episodes}: the seeds of demonstrations lie in "
-                f"[0, {EVALUATION_SEEDS[0]}); evaluations use those from {EVALUATION_SEEDS[0]} on."
-            )
-        if self.root.exists():
-            raise FileExistsError(f"--root={self.root} already exists; choose a new folder.")
+        require(
+            bool(self.skills) and all(0 <= skill <= 1 for skill in self.skills),
+            f"--skill={self.skill} must be one or several numbers in [0, 1]",
+        )
+        require(self.episodes >= 1, f"--episodes must be at least 1, got {self.episodes}")
+        require(
+            0 <= self.seed <= EVALUATION_SEEDS[0] - self.episodes,
+            f"--seed={self.seed} with --episodes={self.episodes}: the seeds of demonstrations lie in "
+            f"[0, {EVALUATION_SEEDS[0]}); evaluations use those from {EVALUATION_SEEDS[0]} on",
+        )
+        require(not self.root.exists(), f"--root={self.root} already exists; choose a new folder")
 
     def make_expert(self) -> Expert | WaysExpert:
         """Expert of the task, with the requested fractions of the ways.
 
         Raises:
-            ValueError: if the task has no expert, or not these ways.
+            FlagError: if the task does not have these ways.
+            ValueError: if the task has no expert.
         """
         expert = make_expert(self.env)
         if self.ways is None:
             return expert
         if not isinstance(expert, WaysExpert):
-            raise ValueError(f"--ways={self.ways}: the expert of --env.task={self.env.task} knows one way.")
+            raise FlagError(f"--ways={self.ways}: the expert of --env.task={self.env.task} knows one way")
         return expert.with_ways(self.ways)
 
     @property
@@ -125,7 +125,7 @@ def record_demos(config: DemosConfig) -> DemosReport:
         RuntimeError: if too few episodes succeed.
         ModuleNotFoundError: if the package of the environment is not installed.
     """
-    assert isinstance(config.env, SingleEnvConfig) and config.env.fps is not None  # as all with experts
+    assert isinstance(config.env, SimulatedEnvConfig) and config.env.fps is not None  # as all with experts
     report = DemosReport(task=str(config.env.task))
     writer = DatasetWriter(config.root, config.repo_id, config.env.fps, dataset_features(config))
 
@@ -178,21 +178,15 @@ def report_table(report: DemosReport) -> Table:
     return table
 
 
-@draccus.wrap()
-def run(config: DemosConfig) -> None:
+@entry_point("lerobot-agpd-demos")
+def main(config: DemosConfig) -> None:
     """Record, report and optionally upload."""
+    disable_progress_bars()  # one bar of the datasets library per episode would tear ours apart
     report = record_demos(config)
     Console().print(report_table(report))
     logger.info("%d episodes, %d frames in %s", len(report.seeds), report.frames, config.root)
     if config.push_to_hub:
         LeRobotDataset(config.repo_id, root=config.root).push_to_hub()
-
-
-def main() -> None:
-    """Console entry point."""
-    disable_progress_bars()  # one bar of the datasets library per episode would tear ours apart
-    with command("lerobot-agpd-demos"):
-        run()
 
 
 if __name__ == "__main__":

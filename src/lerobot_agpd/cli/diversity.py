@@ -2,26 +2,25 @@
 
 import json
 import logging
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import draccus
 import torch
-from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig
 from rich.console import Console
-from rich.table import Table
 
 from lerobot_agpd.agpd import make_strategy
-from lerobot_agpd.cli.command import checkpoint_of_policy_flag, entry_point
-from lerobot_agpd.config import EVALUATION_SEEDS, MixingForm, TeacherConfig, require
+from lerobot_agpd.cli.command import StudentFlags, entry_point
+from lerobot_agpd.config import EVALUATION_SEEDS, MixingForm, require
 from lerobot_agpd.files import write_json
-from lerobot_agpd.loading import load_pair, require_student
+from lerobot_agpd.loading import load_pair
 from lerobot_agpd.replay.episode import Episode
 from lerobot_agpd.rollout.diagnostics import ObservationReservoir
 from lerobot_agpd.rollout.strategies import Strategy
 from lerobot_agpd.studies.frontier import plot_frontier, plot_trajectories
 from lerobot_agpd.studies.sweep import Setting, Sweep, SweepRow, configured
+from lerobot_agpd.studies.tables import console_table
 
 logger = logging.getLogger(__name__)
 
@@ -30,17 +29,11 @@ STUDENT = Setting("interpolate", 1.0)
 
 
 @dataclass
-class DiversityConfig:
+class DiversityConfig(StudentFlags):
     """Options of `lerobot-agpd-diversity`."""
 
-    # Environment to act in.
-    env: EnvConfig
     # Folder of sweep.json, frontier.png and trajectories.png.
     output: Path
-    # The student: --policy.path=<checkpoint of a distilled policy>.
-    policy: PreTrainedConfig | None = None
-    # Flags that are not set are the checkpoint's.
-    teacher: TeacherConfig = field(default_factory=TeacherConfig)
     # Scales of guidance.
     scales: list[float] = field(default_factory=lambda: [0.5, 2.0, 8.0, 32.0, 128.0])
     # Weights of mixing.
@@ -60,7 +53,7 @@ class DiversityConfig:
         Raises:
             FlagError: if there is no checkpoint, or a number is out of range.
         """
-        self.policy = require_student(checkpoint_of_policy_flag() or self.policy)
+        super().__post_init__()
         require(self.episodes >= 2, f"--episodes must be at least 2, got {self.episodes}")
         require(all(scale > 0 for scale in self.scales), f"--scales must be positive, got {self.scales}")
         require(
@@ -68,11 +61,6 @@ class DiversityConfig:
             f"--lambdas must lie between 0 and 1, got {self.lambdas}",
         )
         require(len(self.axes) == 2, f"--axes must name two state dimensions, got {self.axes}")
-
-    @classmethod
-    def __get_path_fields__(cls) -> list[str]:
-        """Fields whose `.path` the parser leaves to `__post_init__`."""
-        return ["policy"]
 
     @property
     def settings(self) -> list[Setting]:
@@ -90,7 +78,7 @@ def sweep_settings(config: DiversityConfig) -> tuple[list[SweepRow], dict[str, l
     Returns:
         One row per setting, and the episodes of teacher, strongest guidance and student, for the picture.
     """
-    student_config = require_student(config.policy)
+    student_config = config.student
     sampler, teacher = load_pair(student_config, config.teacher, config.env)
     seeds = range(config.seed, config.seed + config.episodes)
     sweep = Sweep(student_config, config.env, sampler.normalizer.stats, seeds, config.seed)
@@ -112,17 +100,15 @@ def sweep_settings(config: DiversityConfig) -> tuple[list[SweepRow], dict[str, l
         rows.append(sweep.measure(setting, strategy(setting), episodes, history, student_states))
         if setting.strategy in ("teacher", "guided"):
             shown[setting.strategy] = episodes
-        logger.info("%s", json.dumps(rows[-1].to_json()))
+        logger.info("%s", json.dumps(asdict(rows[-1])))
     return rows, shown
 
 
-def console_table(rows: list[SweepRow]) -> Table:
+def sweep_table(rows: list[SweepRow]) -> list[tuple[str, ...]]:
     """The sweep for the console."""
-    table = Table(
-        "strategy", "strength", "success", "rms to teacher", "rms to student", "entropy", "coverage"
-    )
-    for row in rows:
-        table.add_row(
+    header = ("strategy", "strength", "success", "rms to teacher", "rms to student", "entropy", "coverage")
+    body = [
+        (
             row.setting.strategy,
             f"{row.setting.strength:g}",
             f"{row.success:.2f}",
@@ -131,7 +117,9 @@ def console_table(rows: list[SweepRow]) -> Table:
             "-" if row.entropy is None else f"{row.entropy:.2f}",
             f"{row.coverage:.2f}",
         )
-    return table
+        for row in rows
+    ]
+    return [header, *body]
 
 
 @entry_point("lerobot-agpd-diversity")
@@ -141,15 +129,15 @@ def main(config: DiversityConfig) -> None:
     config.output.mkdir(parents=True, exist_ok=True)
     content = {
         "environment": draccus.encode(config.env, EnvConfig),
-        "policy": str(config.policy.pretrained_path) if config.policy else "",
+        "policy": str(config.student.pretrained_path),
         "first_seed": config.seed,
         "episodes": config.episodes,
-        "rows": [row.to_json() for row in rows],
+        "rows": [asdict(row) for row in rows],
     }
     write_json(config.output / "sweep.json", content, indent=1)
     plot_frontier(content["rows"], config.output / "frontier.png")
     plot_trajectories(shown, (config.axes[0], config.axes[1]), config.output / "trajectories.png")
-    Console().print(console_table(rows))
+    Console().print(console_table(sweep_table(rows)))
     logger.info("numbers and pictures in %s", config.output)
 
 

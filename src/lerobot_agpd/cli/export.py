@@ -14,6 +14,7 @@ from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 from lerobot.utils.random_utils import seeded_context
 
 from lerobot_agpd.cli.command import entry_point
+from lerobot_agpd.config import require
 from lerobot_agpd.loading import load_policy, read_policy_config
 from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
@@ -43,8 +44,7 @@ class ExportConfig:
     def __post_init__(self) -> None:
         if self.output.exists():
             raise FileExistsError(f"--output={self.output} already exists; choose a new folder")
-        if self.push_to_hub and not self.repo_id:
-            raise ValueError("--push_to_hub=true needs --repo_id")
+        require(not self.push_to_hub or bool(self.repo_id), "--push_to_hub=true needs --repo_id")
 
 
 def as_plain(policy: PreTrainedPolicy) -> PreTrainedPolicy:

@@ -6,21 +6,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import draccus
 import numpy as np
 from datasets import disable_progress_bars
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, DONE, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE, REWARD, SUCCESS
 
-from lerobot_agpd.cli.command import command
+from lerobot_agpd.cli.command import entry_point
 from lerobot_agpd.cli.progress import episode_bar
+from lerobot_agpd.config import require
 from lerobot_agpd.dataset_writer import DatasetWriter, Frame, flag, image, vector
+from lerobot_agpd.envs.base import DESCRIPTIONS
 from lerobot_agpd.envs.pusht_recordings import IMAGE_SHAPE, Arrays, block_geometry, load_arrays
 
 logger = logging.getLogger(__name__)
 
 FPS = 10
-TASK = "Push the T-shaped block onto the T-shaped target."
+TASK = DESCRIPTIONS["gym_pusht/PushT-v0"]
 SUCCESS_COVERAGE = 0.95
 
 Variant = Literal["keypoints", "state", "image"]
@@ -51,24 +52,23 @@ class ImportPushTConfig:
         """Check the options.
 
         Raises:
-            ValueError: if an option is impossible.
-            FileExistsError: if `root` exists.
-            FileNotFoundError: if `source` does not.
+            FlagError: if an option is impossible.
         """
-        if self.root.exists():
-            raise FileExistsError(f"--root={self.root} already exists; choose a new folder")
+        require(not self.root.exists(), f"--root={self.root} already exists; choose a new folder")
         for name, path in (("source", self.source), ("images", self.images)):
-            if path is not None and not path.exists():
-                raise FileNotFoundError(f"--{name}={path} does not exist")
-        if self.episodes is not None and self.first_episodes is not None:
-            raise ValueError("give either --episodes or --first_episodes, not both")
-        if self.first_episodes is not None and self.first_episodes < 1:
-            raise ValueError(f"--first_episodes must be at least 1, got {self.first_episodes}")
-        if self.episodes is not None and (
-            not self.episodes or min(self.episodes) < 0 or len(set(self.episodes)) < len(self.episodes)
-        ):
-            raise ValueError(
-                f"--episodes={self.episodes} must name at least one episode, counted from 0, and none twice"
+            require(path is None or path.exists(), f"--{name}={path} does not exist")
+        require(
+            self.episodes is None or self.first_episodes is None,
+            "give either --episodes or --first_episodes, not both",
+        )
+        require(
+            self.first_episodes is None or self.first_episodes >= 1,
+            f"--first_episodes must be at least 1, got {self.first_episodes}",
+        )
+        if self.episodes is not None:
+            require(
+                min(self.episodes, default=-1) >= 0 and len(set(self.episodes)) == len(self.episodes),
+                f"--episodes={self.episodes} must name at least one episode, counted from 0, and none twice",
             )
 
 
@@ -144,20 +144,14 @@ def import_pusht(config: ImportPushTConfig) -> LeRobotDataset:
         return writer.write(frames, lambda: advance(1))
 
 
-@draccus.wrap()
-def run(config: ImportPushTConfig) -> None:
+@entry_point("lerobot-agpd-import-pusht")
+def main(config: ImportPushTConfig) -> None:
     """Import, report and optionally upload."""
+    disable_progress_bars()  # one bar of the datasets library per episode would tear ours apart
     dataset = import_pusht(config)
     logger.info("%d episodes, %d frames in %s", dataset.num_episodes, dataset.num_frames, config.root)
     if config.push_to_hub:
         dataset.push_to_hub()
-
-
-def main() -> None:
-    """Console entry point."""
-    disable_progress_bars()  # one bar of the datasets library per episode would tear ours apart
-    with command("lerobot-agpd-import-pusht"):
-        run()
 
 
 if __name__ == "__main__":

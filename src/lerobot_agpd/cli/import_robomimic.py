@@ -4,6 +4,7 @@ Beside the dataset, `meta/robomimic.json` says where every episode comes from, a
 recordings in full precision with simulator states and models, for replaying them.
 """
 
+import hashlib
 import json
 import logging
 import sys
@@ -12,12 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import draccus
 from datasets import disable_progress_bars
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_agpd.cli.command import command
+from lerobot_agpd.cli.command import entry_point
 from lerobot_agpd.cli.progress import episode_bar
+from lerobot_agpd.config import require
 from lerobot_agpd.dataset_writer import DatasetWriter
 from lerobot_agpd.envs.robomimic_columns import DONES, REWARDS, RobomimicColumns, cameras_of, task_of
 from lerobot_agpd.envs.robomimic_hdf5 import RobomimicFile, sha256
@@ -60,22 +61,21 @@ class ImportRobomimicConfig:
         """Check the options.
 
         Raises:
-            ValueError: if an option is impossible.
-            FileExistsError: if `root` exists.
-            FileNotFoundError: if `source` is not a file.
+            FlagError: if an option is impossible.
         """
-        if not self.source.is_file():
-            raise FileNotFoundError(f"--source={self.source} is not a file; expected robomimic's .hdf5")
-        if self.root.exists():
-            raise FileExistsError(f"--root={self.root} already exists; choose a new folder")
-        if self.episodes is not None and self.filter_key is not None:
-            raise ValueError("give either --episodes or --filter_key, not both")
-        if self.episodes is not None and (not self.episodes or len(set(self.episodes)) < len(self.episodes)):
-            raise ValueError(f"--episodes={self.episodes} must name at least one episode, and none twice")
-        if not self.images and (self.cameras or self.video):
-            raise ValueError("--cameras and --video need --images=true")
-        if self.episodes_per_shard < 1:
-            raise ValueError(f"--episodes_per_shard must be at least 1, got {self.episodes_per_shard}")
+        require(self.source.is_file(), f"--source={self.source} is not a file; expected robomimic's .hdf5")
+        require(not self.root.exists(), f"--root={self.root} already exists; choose a new folder")
+        if self.episodes is not None:
+            require(self.filter_key is None, "give either --episodes or --filter_key, not both")
+            require(
+                0 < len(self.episodes) == len(set(self.episodes)),
+                f"--episodes={self.episodes} must name at least one episode, and none twice",
+            )
+        require(self.images or not (self.cameras or self.video), "--cameras and --video need --images=true")
+        require(
+            self.episodes_per_shard >= 1,
+            f"--episodes_per_shard must be at least 1, got {self.episodes_per_shard}",
+        )
 
 
 def columns_of(config: ImportRobomimicConfig, file: RobomimicFile) -> RobomimicColumns:
@@ -117,6 +117,7 @@ def provenance(file: RobomimicFile, demos: Sequence[str], digest: str) -> dict[s
         digest: SHA-256 of the file.
     """
     operators = [*file.operators, None]  # -1 is none of them
+    models = {demo: file.model_xml(demo) for demo in demos}
     return {
         "source": {"file": file.path.name, "sha256": digest, "bytes": file.path.stat().st_size},
         "env_args": file.env_args,
@@ -129,9 +130,9 @@ def provenance(file: RobomimicFile, demos: Sequence[str], digest: str) -> dict[s
                 "demo": demo,
                 "length": file.length(demo),
                 "operator": operators[file.operator_of(demo)],
-                "model_sha256": file.model_sha256(demo),
+                "model_sha256": model and hashlib.sha256(model.encode()).hexdigest(),
             }
-            for demo in demos
+            for demo, model in models.items()
         ],
     }
 
@@ -180,27 +181,21 @@ def warn_about_replays(file: RobomimicFile, demos: Sequence[str]) -> None:
         logger.warning("%s lacks states or model_file of %s: they cannot be replayed", file.path, lacking)
 
 
-@draccus.wrap()
+@entry_point("lerobot-agpd-import-robomimic")
 def run(config: ImportRobomimicConfig) -> None:
     """Import, report and optionally upload."""
+    disable_progress_bars()  # one bar of the datasets library per episode would tear ours apart
     dataset = import_robomimic(config)
     logger.info("%d episodes, %d frames in %s", dataset.num_episodes, dataset.num_frames, config.root)
     if config.push_to_hub:
         dataset.push_to_hub()
 
 
-def with_source_flag(arguments: Sequence[str]) -> list[str]:
-    """Turn a first word into `--source=`, since draccus knows no positional arguments."""
-    if arguments and not arguments[0].startswith("-"):
-        return [f"--source={arguments[0]}", *arguments[1:]]
-    return list(arguments)
-
-
 def main() -> None:
-    """Console entry point."""
-    disable_progress_bars()  # one bar of the datasets library per episode would tear ours apart
-    with command("lerobot-agpd-import-robomimic"):
-        run(draccus.parse(ImportRobomimicConfig, args=with_source_flag(sys.argv[1:])))
+    """Console entry point; a first word is `--source=`, since draccus knows no positional arguments."""
+    if sys.argv[1:] and not sys.argv[1].startswith("-"):
+        sys.argv[1] = f"--source={sys.argv[1]}"
+    run()
 
 
 if __name__ == "__main__":

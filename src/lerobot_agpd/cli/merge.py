@@ -4,10 +4,8 @@ import logging
 from dataclasses import dataclass
 from pathlib import Path
 
-import draccus
-
-from lerobot_agpd.cli.command import command
-from lerobot_agpd.config import require
+from lerobot_agpd.cli.command import entry_point
+from lerobot_agpd.config import FlagError, require
 from lerobot_agpd.replay.export import merge
 
 logger = logging.getLogger(__name__)
@@ -29,22 +27,16 @@ class MergeConfig:
         require(not self.push_to_hub or bool(self.repo_id), "--push_to_hub=true needs --repo_id")
 
 
-@draccus.wrap()
-def run(config: MergeConfig) -> None:
+@entry_point("lerobot-agpd-merge")
+def main(config: MergeConfig) -> None:
     """Merge all kept episodes, and upload."""
     merged = merge(config.root, config.repo_id)
-    require(merged is not None, f"--root={config.root} holds no kept episode")
-    assert merged is not None
+    if merged is None:
+        raise FlagError(f"--root={config.root} holds no kept episode")
     logger.info("%d episodes, %d frames in %s", merged.num_episodes, merged.num_frames, merged.root)
     if config.push_to_hub:
         merged.push_to_hub()
         logger.info("uploaded to %s", config.repo_id)
-
-
-def main() -> None:
-    """Console entry point."""
-    with command("lerobot-agpd-merge"):
-        run()
 
 
 if __name__ == "__main__":

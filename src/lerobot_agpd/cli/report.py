@@ -2,23 +2,23 @@
 
 import logging
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import draccus
 from lerobot.envs import EnvConfig
 from rich.console import Console
-from rich.table import Table
 
 from lerobot_agpd.cli.command import entry_point
 from lerobot_agpd.config import EVALUATION_SEEDS, require
 from lerobot_agpd.progress import REPLAY_FOLDER
 from lerobot_agpd.rollout.report import read_reports
 from lerobot_agpd.studies.curves import draw_report_curves
-from lerobot_agpd.studies.evaluation import Environments, Evaluator, checkpoint_config, checkpoint_steps
+from lerobot_agpd.studies.evaluation import Evaluator, checkpoint_config, checkpoint_steps
 from lerobot_agpd.studies.report import write_summary
 from lerobot_agpd.studies.results import Result
-from lerobot_agpd.studies.tables import summary_table
+from lerobot_agpd.studies.tables import console_table, summary_table
 
 logger = logging.getLogger(__name__)
 
@@ -51,8 +51,10 @@ class ReportConfig:
     title: str = ""
 
     def __post_init__(self) -> None:
-        if not self.runs and not self.policies:
-            raise ValueError("nothing to report: name runs (--runs='{name: folder}') or --policies")
+        require(
+            bool(self.runs or self.policies),
+            "nothing to report: name runs (--runs='{name: folder}') or --policies",
+        )
         for name, path in {**self.runs, **self.policies}.items():
             if not Path(path).exists():
                 raise FileNotFoundError(f"'{name}': {path} does not exist")
@@ -68,30 +70,27 @@ class ReportConfig:
             f"--seed={self.seed}: environments of an evaluation lie in [{low}, {high}), which training and collection "
             "never use",
         )
-        for path in (*self.policies.values(), *(last_checkpoint(run) for run in self.runs.values())):
+        for path in (*self.policies.values(), *map(last_checkpoint, self.runs.values())):
             for n_steps in self.n_action_steps:
-                checkpoint_config(path, n_steps)
+                checkpoint_config(path, self.device, n_steps)
 
 
 def last_checkpoint(run: Path) -> Path:
     """The policy of a run's last checkpoint."""
-    steps = checkpoint_steps(run)
-    return steps[max(steps)]
+    return list(checkpoint_steps(run).values())[-1]
 
 
 def report_run(name: str, run: Path, evaluator: Evaluator, config: ReportConfig) -> list[Result]:
     """Evaluate a run's last checkpoint, and the earlier ones for its learning curve."""
     first, *others = report_policy(name, last_checkpoint(run), evaluator, config)
+    *earlier, last = checkpoint_steps(run).items()
     curve = {}
-    if config.curve_episodes:
-        *earlier, last = checkpoint_steps(run).items()
+    if config.curve_episodes and earlier:
         n_steps = config.n_action_steps[0] if config.n_action_steps else None
         for step, path in earlier:
             curve[step] = evaluator.evaluate(path, config.curve_episodes, config.seed, n_steps)
-        if curve:
-            curve[last[0]] = first.finals["last"]
-    rounds = read_reports(run / REPLAY_FOLDER)
-    return [replace(first, curve=curve, rounds=rounds), *others]
+        curve[last[0]] = first.finals["last"]
+    return [replace(first, curve=curve, rounds=read_reports(run / REPLAY_FOLDER)), *others]
 
 
 def report_policy(name: str, path: Path, evaluator: Evaluator, config: ReportConfig) -> list[Result]:
@@ -101,17 +100,8 @@ def report_policy(name: str, path: Path, evaluator: Evaluator, config: ReportCon
     for n_steps in numbers:
         row = name if n_steps is None else f"{name}, {n_steps} step{'s' * (n_steps != 1)} per chunk"
         final = evaluator.evaluate(path, config.episodes, config.seed, n_steps)
-        results.append(Result(name=row, finals={"last": final}, latency=evaluator.latency(path, n_steps)))
+        results.append(Result(name=row, finals={"last": final}, latency=evaluator.latency(path)))
     return results
-
-
-def show(results: list[Result]) -> None:
-    """Show the table."""
-    header, *rows = summary_table(results)
-    table = Table(*header)
-    for row in rows:
-        table.add_row(*row)
-    Console().print(table)
 
 
 @entry_point("lerobot-agpd-report")
@@ -120,14 +110,14 @@ def main(config: ReportConfig) -> None:
     config.output.mkdir(parents=True, exist_ok=True)
     environment = draccus.encode(config.env, EnvConfig)
     results: list[Result] = []
-    with Environments(config.env, min(config.batch_size, config.episodes)) as environments:
-        evaluator = Evaluator(environments, config.output, config.device)
+    n_envs = min(config.batch_size, config.episodes)
+    with closing(Evaluator(config.env, n_envs, config.output, config.device)) as evaluator:
         for entries, evaluate in ((config.policies, report_policy), (config.runs, report_run)):
             for name, path in entries.items():
                 results += evaluate(name, path, evaluator, config)
                 write_summary(results, environment, config.seed, config.output)
     draw_report_curves(results, config.title, config.output / "curves.png")
-    show(results)
+    Console().print(console_table(summary_table(results)))
     logger.info("wrote report.json, report.md and curves.png to %s", config.output)
 
 

@@ -4,28 +4,26 @@ import logging
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import rerun as rr
 import torch
-from lerobot.configs import PreTrainedConfig
-from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors
+from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
 from rich.console import Console
 from rich.table import Table
 
 from lerobot_agpd.agpd import GuidedStrategy
-from lerobot_agpd.cli.command import checkpoint_of_policy_flag, entry_point
-from lerobot_agpd.config import EVALUATION_SEEDS, StudentConfig, TeacherConfig, require
-from lerobot_agpd.loading import load_pair, require_student
-from lerobot_agpd.progress import Progress, find_replay_root
-from lerobot_agpd.replay.episode import Episode, EpisodeSpec
+from lerobot_agpd.cli.command import StudentFlags, entry_point
+from lerobot_agpd.config import EVALUATION_SEEDS, require
+from lerobot_agpd.loading import load_pair
+from lerobot_agpd.progress import REPLAY_FOLDER, Progress
+from lerobot_agpd.replay.episode import Array, EpisodeSpec
 from lerobot_agpd.rollout.report import read_reports
 from lerobot_agpd.rollout.rollout import Rollouts
-from lerobot_agpd.run import RunInfo
-from lerobot_agpd.studies.recording import Array, DecisionRecorder, FrameRecorder, RolloutRecord
+from lerobot_agpd.studies.recording import DecisionRecorder, FrameRecorder, RolloutRecord
 from lerobot_agpd.studies.rerun_log import blueprint, layout, log_rollout
 from lerobot_agpd.studies.still import draw_still
 
@@ -35,15 +33,9 @@ APPLICATION = "lerobot-agpd-viz"
 
 
 @dataclass
-class VizConfig:
+class VizConfig(StudentFlags):
     """Options of `lerobot-agpd-viz`."""
 
-    # Environment to act in.
-    env: EnvConfig
-    # The student: --policy.path=<checkpoint of a distilled policy>.
-    policy: PreTrainedConfig | None = None
-    # Flags that are not set are the checkpoint's.
-    teacher: TeacherConfig = field(default_factory=TeacherConfig)
     # Episodes to record.
     episodes: int = 1
     # Environment seed of the first episode; also seeds the noise.
@@ -65,14 +57,9 @@ class VizConfig:
         Raises:
             ValueError: if there is no checkpoint, or a number is out of range.
         """
-        self.policy = require_student(checkpoint_of_policy_flag() or self.policy)
+        super().__post_init__()
         require(self.episodes >= 1, f"--episodes must be at least 1, got {self.episodes}")
         require(self.scale is None or self.scale >= 0, f"--scale must not be negative, got {self.scale}")
-
-    @classmethod
-    def __get_path_fields__(cls) -> list[str]:
-        """Fields whose `.path` the parser leaves to `__post_init__`."""
-        return ["policy"]
 
 
 # ---- student and teacher ----
@@ -84,7 +71,7 @@ def make_guided_strategy(config: VizConfig) -> GuidedStrategy:
     Raises:
         FlagError: if teacher, student and environment do not fit together.
     """
-    student_config = require_student(config.policy)
+    student_config = config.student
     sampler, teacher = load_pair(student_config, config.teacher, config.env)
     noise = torch.Generator(device=student_config.device or "cpu").manual_seed(config.seed)
     return GuidedStrategy(sampler.pair_with(teacher), noise, student_config.guidance)
@@ -94,33 +81,24 @@ def guidance_scale(config: VizConfig) -> float:
     """`--scale`, else what the checkpoint's run would use in its next round, else where a run starts."""
     if config.scale is not None:
         return config.scale
-    student_config = require_student(config.policy)
-    start = student_config.guidance.scale
+    student_config = config.student
     assert student_config.pretrained_path is not None
     try:
         progress = Progress.read(student_config.pretrained_path)
     except FileNotFoundError:  # a checkpoint from the Hub, or one that never trained
-        return start
-    reports = read_reports(_replay_root(student_config, progress))[: progress.rounds]
+        return student_config.guidance.scale
+    beside = student_config.pretrained_path.resolve().parents[2] / REPLAY_FOLDER
+    reports = read_reports(Path(student_config.replay.root or beside))[: progress.rounds]
     if len(reports) < progress.rounds:
-        logger.warning("the collected rounds of the checkpoint's run were not found; the scale is %g", start)
-        return start
-    return reports[-1].next_scale if reports else start
-
-
-def _replay_root(student_config: StudentConfig, progress: Progress) -> Path:
-    assert progress.checkpoint is not None
-    return find_replay_root(
-        student_config, RunInfo(output_dir=progress.checkpoint.resolve().parents[2]), progress
-    )
+        logger.warning("the collected rounds of the checkpoint's run were not found")
+        return student_config.guidance.scale
+    return reports[-1].next_scale if reports else student_config.guidance.scale
 
 
 # ---- recording a rollout ----
 
 
-def record_rollouts(
-    config: VizConfig, guided: GuidedStrategy, scale: float
-) -> Iterator[tuple[Episode, RolloutRecord]]:
+def record_rollouts(config: VizConfig, guided: GuidedStrategy, scale: float) -> Iterator[RolloutRecord]:
     """Play the episodes one by one."""
     tasks = make_env(config.env, n_envs=1)
     env = next(iter(next(iter(tasks.values())).values()))
@@ -131,18 +109,8 @@ def record_rollouts(
     try:
         for episode in Rollouts(frames or env, processors, guided, recorder).run(specs):
             pictures = frames.frames if frames is not None else []
-            yield (
-                episode,
-                RolloutRecord(
-                    observations=episode.observations,
-                    actions=episode.actions,
-                    rewards=episode.rewards,
-                    successes=episode.successes,
-                    decisions=recorder.decisions,
-                    frames=pictures,
-                    to_frame=plane_to_frame(env.single_action_space, pictures[0] if pictures else None),
-                ),
-            )
+            to_frame = plane_to_frame(env.single_action_space, pictures[0] if pictures else None)
+            yield RolloutRecord(episode, recorder.decisions, pictures, to_frame)
             recorder.decisions = []
     finally:
         close_envs(tasks)
@@ -179,37 +147,31 @@ def visualize(config: VizConfig) -> Table:
     config.output.parent.mkdir(parents=True, exist_ok=True)
     with rr.RecordingStream(APPLICATION) as stream:
         stream.save(config.output)
-        for number, (episode, rollout) in enumerate(record_rollouts(config, guided, scale)):
+        for number, rollout in enumerate(record_rollouts(config, guided, scale)):
             root = f"episode_{number}"
             log_rollout(stream, root, rollout)
             layouts.append(layout(root, rollout))
             stream.send_blueprint(blueprint(layouts))
-            table.add_row(*_row(episode, rollout))
+            table.add_row(*_row(rollout))
             if config.png is not None and number == 0:
                 config.png.parent.mkdir(parents=True, exist_ok=True)
                 draw_still(rollout, config.png)
     return table
 
 
-def _row(episode: Episode, rollout: RolloutRecord) -> tuple[str, ...]:
+def _row(rollout: RolloutRecord) -> tuple[str, ...]:
+    episode, decisions = rollout.episode, rollout.decisions
     success = "-" if episode.is_success is None else str(episode.is_success)
-    alone = np.mean([decision.teacher_discrepancy for decision in rollout.decisions])
-    guided = np.mean([decision.guided_discrepancy for decision in rollout.decisions])
-    return (
-        str(episode.spec.seed),
-        str(len(episode)),
-        f"{episode.max_reward:.3f}",
-        success,
-        f"{alone:.3g}",
-        f"{guided:.3g}",
-    )
+    alone = np.mean([decision.teacher_discrepancy for decision in decisions])
+    guided = np.mean([decision.guided_discrepancy for decision in decisions])
+    cells = (str(episode.spec.seed), str(len(episode)), f"{episode.max_reward:.3f}", success)
+    return (*cells, f"{alone:.3g}", f"{guided:.3g}")
 
 
 @entry_point("lerobot-agpd-viz")
 def main(config: VizConfig) -> None:
     """Record and report."""
-    table = visualize(config)
-    Console().print(table)
+    Console().print(visualize(config))
     logger.info("recording in %s (open it with `rerun %s`)", config.output, config.output)
     if config.png is not None:
         logger.info("still picture in %s", config.png)

@@ -1,168 +1,212 @@
 """What the environment types share: raw observation keys, options, features, and how environments are built."""
 
-import importlib
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from typing import Literal
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import gymnasium as gym
-import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from lerobot.envs.configs import EnvConfig
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_IMAGES, OBS_STATE
+
+from lerobot_agpd.config import require
 
 AGENT_POS = "agent_pos"
 ENVIRONMENT_STATE = "environment_state"
 PIXELS = "pixels"
 """Raw keys that LeRobot's `preprocess_observation` turns into its own."""
 
+OBSERVED_KEYS: dict[str, tuple[str, ...]] = {
+    "state": (AGENT_POS, ENVIRONMENT_STATE),
+    "environment_state_agent_pos": (AGENT_POS, ENVIRONMENT_STATE),
+    "pixels_agent_pos": (AGENT_POS, PIXELS),
+    "pixels": (PIXELS,),
+    "pixels_environment_state_agent_pos": (AGENT_POS, ENVIRONMENT_STATE, PIXELS),
+}
+"""Raw keys of every `--env.obs_type`; each environment type has some of them."""
 
-def unbounded(dim: int) -> gym.spaces.Box:
-    """Space of float32 vectors (dim,) without bounds."""
-    return gym.spaces.Box(-np.inf, np.inf, shape=(dim,), dtype=np.float32)
+DESCRIPTIONS = {
+    "gym_pusht/PushT-v0": "Push the T-shaped block onto the T-shaped target.",
+    "gym_aloha/AlohaInsertion-v0": "Insert the peg into the socket.",
+    "gym_aloha/AlohaTransferCube-v0": "Pick up the cube with the right arm and hand it to the left arm.",
+}
+"""Task descriptions of gymnasium's environments that have none of their own."""
 
 
-def image_space(height: int, width: int) -> gym.spaces.Box:
-    """Space of uint8 images (height, width, 3)."""
-    return gym.spaces.Box(0, 255, shape=(height, width, 3), dtype=np.uint8)
+@dataclass(frozen=True, kw_only=True)
+class TaskSpec:
+    """Properties of one task.
 
-
-def make_vector_env(factory: Callable[[], gym.Env], n_envs: int, use_async_envs: bool) -> VectorEnv:
-    """Build a vector environment as LeRobot's `EnvConfig.create_envs` does, from a factory.
-
-    LeRobot's own factory runs `gymnasium.make` alone and fails in forkserver workers, where nothing has imported the
-    package that registers the id.
-
-    Args:
-        factory: builds one environment; a process that has imported nothing yet must be able to call it.
-        n_envs: number of environments.
-        use_async_envs: one process per environment, if there are at least two.
-
-    Returns:
-        The vector environment, autoreset in the same step.
+    Attributes:
+        description: one sentence, LeRobot's `task_description`.
+        fps: control steps per second of simulated time, rounded down.
+        episode_length: steps after which an episode is truncated by default.
+        action_dim: length of an action.
+        agent_pos_dim: length of `agent_pos`.
+        environment_state_dim: length of `environment_state`.
     """
-    factories = [factory] * n_envs
-    if use_async_envs and n_envs > 1:
-        return AsyncVectorEnv(factories, context="forkserver", autoreset_mode=AutoresetMode.SAME_STEP)
-    return SyncVectorEnv(factories, autoreset_mode=AutoresetMode.SAME_STEP)
+
+    description: str
+    fps: int
+    episode_length: int
+    action_dim: int
+    agent_pos_dim: int
+    environment_state_dim: int
 
 
-def require_packages(names: Sequence[str], user: str, extra: str) -> None:
-    """Import packages that an optional extra installs.
+@dataclass(frozen=True)
+class View:
+    """What an environment shows; sizes of images are (height, width) in pixels.
 
-    Args:
-        names: packages; importing them registers their environments.
-        user: what needs them, for the message.
-        extra: name of the extra.
-
-    Raises:
-        ModuleNotFoundError: naming the extra, if one of them or one of their requirements is not installed.
+    Attributes:
+        keys: observed raw keys.
+        cameras: cameras whose images are observed, each under its name; none: one image without a name.
+        observation_size: of observed images.
+        visualization_size: of rendered frames.
+        shadows: whether images show them; without a GPU they take most of the time.
     """
-    try:
-        for name in names:
-            importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            f"{user} needs the package {error.name!r}, which is not installed. "
-            f"Run: pip install 'lerobot_policy_agpd[{extra}]'",
-            name=error.name,
-        ) from error
+
+    keys: tuple[str, ...] = (AGENT_POS, ENVIRONMENT_STATE)
+    cameras: tuple[str, ...] = ()
+    observation_size: tuple[int, int] = (96, 96)
+    visualization_size: tuple[int, int] = (480, 480)
+    shadows: bool = True
 
 
-RenderMode = Literal["rgb_array"]
-"""Values of `--env.render_mode`. An alias, since draccus finds no comment of a field with quotes in its annotation."""
+def require_choice(option: str, value: str | list[str] | None, choices: Iterable[str]) -> None:
+    """Raise FlagError unless the value of `--env.<option>` is one of the choices, or a list of at least one."""
+    values = value if isinstance(value, list) else [value]
+    require(
+        bool(values) and set(values) <= set(choices),
+        f"--env.{option}={value} must be {'at least one' if isinstance(value, list) else 'one'} of "
+        f"{', '.join(choices)}",
+    )
 
 
-class SingleEnvConfig(ABC):
-    """Mixin for an `EnvConfig` whose environments are built from a factory, alone or several at a time."""
+@dataclass
+class SimulatedEnvConfig(EnvConfig):
+    """Options of every environment type here.
 
-    # Of EnvConfig:
-    type: str
-    task: str | None
-    fps: int | None
-    features: dict[str, PolicyFeature]
-    features_map: dict[str, str]
-    # Of every type here:
-    obs_type: str
-    episode_length: int | None
-    render_mode: str
-    observation_height: int
-    observation_width: int
+    A type names its `tasks` and `obs_types` (and perhaps more choices), and builds an environment. Choices are no Literal
+    types: argparse would hold the flags of every other environment type to them, since all have the same names.
+    """
 
-    def check_options(
-        self, observed_keys: Mapping[str, tuple[str, ...]], fps: int, episode_length: int | None = None
-    ) -> None:
-        """Check the options of every type, and fill in what the task decides where it is None.
+    tasks: ClassVar[Mapping[str, TaskSpec]]
+    obs_types: ClassVar[tuple[str, ...]] = ("state", "pixels_agent_pos", "pixels")
 
-        Args:
-            observed_keys: raw keys of every `obs_type`.
-            fps: the simulation's control steps per second.
-            episode_length: the task's own limit, if it has one.
+    # Control steps per second; default: the task's, the only possible value.
+    fps: int | None = None
+    # Steps after which an episode is truncated; default: the task's own limit.
+    episode_length: int | None = None
+    # What is observed: state, pixels_agent_pos or pixels.
+    obs_type: str = "state"
+    # Height of observed images, pixels.
+    observation_height: int = 96
+    # Width of observed images, pixels.
+    observation_width: int = 96
+    # Height of rendered frames, pixels.
+    visualization_height: int = 480
+    # Width of rendered frames, pixels.
+    visualization_width: int = 480
+    # Draw shadows; without a GPU an image is several times faster without.
+    shadows: bool = True
+    # gymnasium's render mode, rgb_array; nothing is rendered before `render` is called.
+    render_mode: str = "rgb_array"
+    # Derived from the task.
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    # Raw key to LeRobot key, derived from the task.
+    features_map: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check the options, fill in what the task decides and derive the features.
 
         Raises:
-            ValueError: naming the option that is impossible.
+            FlagError: naming the option that is impossible.
         """
-        if self.obs_type not in observed_keys:
-            raise ValueError(
-                f"--env.obs_type must be one of {', '.join(observed_keys)}; got {self.obs_type!r}."
-            )
-        if self.render_mode != "rgb_array":
-            raise ValueError(f"--env.render_mode={self.render_mode}: only rgb_array can be rendered.")
-        self.fps = fps if self.fps is None else self.fps
-        if self.fps != fps:
-            raise ValueError(f"--env.fps={self.fps}: {self.task} runs at {fps} steps per second.")
-        self.episode_length = episode_length if self.episode_length is None else self.episode_length
-        if self.episode_length is None or self.episode_length < 1:
-            raise ValueError(f"--env.episode_length must be at least 1, got {self.episode_length}.")
-        if min(self.observation_height, self.observation_width) < 4:  # LeRobot takes 1 to 3 for channels
-            raise ValueError(
-                f"--env.observation_height={self.observation_height} and --env.observation_width="
-                f"{self.observation_width} must be at least 4 pixels."
-            )
+        for option, choices in self.choices.items():
+            require_choice(option, getattr(self, option), choices)
+        self.fps = self.spec.fps if self.fps is None else self.fps
+        require(
+            self.fps == self.spec.fps,
+            f"--env.fps={self.fps}: {self.task} runs at {self.spec.fps} steps per second",
+        )
+        if self.episode_length is None:
+            self.episode_length = self.spec.episode_length
+        require(self.episode_length >= 1, f"--env.episode_length={self.episode_length} must be at least 1")
+        require(
+            min(self.observation_height, self.observation_width) >= 4,  # LeRobot takes 1 to 3 for channels
+            f"--env.observation_height={self.observation_height} and --env.observation_width="
+            f"{self.observation_width} must be at least 4 pixels",
+        )
+        self._set_features()
 
-    def set_features(
-        self,
-        keys: Sequence[str],
-        action_dim: int,
-        agent_pos_dim: int,
-        environment_state_dim: int,
-        image_keys: Mapping[str, str],
-    ) -> None:
-        """Declare the action and what is observed.
-
-        Args:
-            keys: observed raw keys.
-            action_dim: length of an action.
-            agent_pos_dim: length of `agent_pos`.
-            environment_state_dim: length of `environment_state`.
-            image_keys: raw key of every image to its LeRobot key.
-        """
-        self.features = {ACTION: PolicyFeature(FeatureType.ACTION, (action_dim,))}
+    def _set_features(self) -> None:
+        view = self.view
+        images = {f"{PIXELS}/{camera}": f"{OBS_IMAGES}.{camera}" for camera in view.cameras}
+        images = (images or {PIXELS: OBS_IMAGE}) if PIXELS in view.keys else {}
+        vectors = {
+            AGENT_POS: PolicyFeature(FeatureType.STATE, (self.spec.agent_pos_dim,)),
+            ENVIRONMENT_STATE: PolicyFeature(FeatureType.ENV, (self.spec.environment_state_dim,)),
+        }
+        image = PolicyFeature(FeatureType.VISUAL, (*view.observation_size, 3))
+        self.features = {
+            ACTION: PolicyFeature(FeatureType.ACTION, (self.spec.action_dim,)),
+            **{key: feature for key, feature in vectors.items() if key in view.keys},
+            **dict.fromkeys(images, image),
+        }
         self.features_map = {
             ACTION: ACTION,
             AGENT_POS: OBS_STATE,
             ENVIRONMENT_STATE: OBS_ENV_STATE,
-            **image_keys,
+            **images,
         }
-        if AGENT_POS in keys:
-            self.features[AGENT_POS] = PolicyFeature(FeatureType.STATE, (agent_pos_dim,))
-        if ENVIRONMENT_STATE in keys:
-            self.features[ENVIRONMENT_STATE] = PolicyFeature(FeatureType.ENV, (environment_state_dim,))
-        if PIXELS in keys:
-            shape = (self.observation_height, self.observation_width, 3)
-            self.features |= {key: PolicyFeature(FeatureType.VISUAL, shape) for key in image_keys}
 
     @property
-    @abstractmethod
-    def factory(self) -> Callable[[], gym.Env]:
-        """Function that builds one environment; picklable, for worker processes that have imported nothing yet."""
+    def choices(self) -> dict[str, Iterable[str]]:
+        """Possible values of the options that have a few."""
+        return {"task": self.tasks, "obs_type": self.obs_types, "render_mode": ("rgb_array",)}
 
+    @property
+    def spec(self) -> TaskSpec:
+        """Properties of the task."""
+        return self.tasks[str(self.task)]
+
+    @property
+    def observed_cameras(self) -> tuple[str, ...]:
+        """Cameras whose images are observed, each under its name; none: one image without a name."""
+        return ()
+
+    @property
+    def view(self) -> View:
+        """What the environments show."""
+        return View(
+            OBSERVED_KEYS[self.obs_type],
+            self.observed_cameras,
+            (self.observation_height, self.observation_width),
+            (self.visualization_height, self.visualization_width),
+            self.shadows,
+        )
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Nothing: `make_single` builds the environments, not LeRobot by an id."""
+        return {}
+
+    @abstractmethod
     def make_single(self) -> gym.Env:
-        """Build one environment."""
-        return self.factory()
+        """Build one environment; no graphics context is opened before the first image.
+
+        Raises:
+            ModuleNotFoundError: if the package of the simulation is not installed.
+        """
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
-        """Build the vector environment; see `make_vector_env`.
+        """Build a vector environment as LeRobot's own configurations do, autoreset in the same step.
+
+        Those run `gymnasium.make` alone, which fails in forkserver workers, where nothing has imported the package that
+        registers the id.
 
         Args:
             n_envs: number of environments.
@@ -172,6 +216,12 @@ class SingleEnvConfig(ABC):
             `{type: {0: vector environment}}`.
 
         Raises:
-            ModuleNotFoundError: if the package of the environment is not installed.
+            ModuleNotFoundError: if the package of the simulation is not installed.
         """
-        return {self.type: {0: make_vector_env(self.factory, n_envs, use_async_envs)}}
+        factories = [self.make_single] * n_envs  # picklable: workers import this package
+        mode = AutoresetMode.SAME_STEP
+        if use_async_envs and n_envs > 1:
+            env: VectorEnv = AsyncVectorEnv(factories, context="forkserver", autoreset_mode=mode)
+        else:
+            env = SyncVectorEnv(factories, autoreset_mode=mode)
+        return {self.type: {0: env}}

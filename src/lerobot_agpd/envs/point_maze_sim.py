@@ -2,7 +2,6 @@
 
 import tempfile
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,25 +11,15 @@ import numpy as np
 from gymnasium_robotics.envs.maze.maze_v4 import Maze
 from gymnasium_robotics.envs.maze.point import PointEnv
 
-from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS, image_space, unbounded
-from lerobot_agpd.envs.rendering import SceneRenderer
-from lerobot_agpd.envs.robotics_tasks import OBSERVED_KEYS
-from lerobot_agpd.envs.ways import ACTION_DIM, AGENT_POS_DIM, FPS, WALL, WaysTask, get_task
+from lerobot_agpd.envs.base import View
+from lerobot_agpd.envs.rendering import ViewedEnv
+from lerobot_agpd.envs.ways import FPS, TASKS, WALL, WaysTask
 
 WALL_HEIGHT = 0.4  # meters, PointMaze's
 GOAL_RADIUS = 0.45  # meters, PointMaze's
 START_NOISE = 0.15  # meters in x and y, at most
 FRAME_SKIP = 10
 assert FRAME_SKIP * FPS == 100  # PointMaze's steps per second
-
-
-@dataclass(frozen=True)
-class View:
-    """Type of the observation, and sizes of images, (height, width) in pixels."""
-
-    obs_type: str = "state"
-    observation_size: tuple[int, int] = (96, 96)
-    visualization_size: tuple[int, int] = (480, 480)
 
 
 def build_point(task: WaysTask) -> PointEnv:
@@ -62,7 +51,7 @@ def mujoco_assets() -> str:
     return str(Path(gymnasium_robotics.__file__).parent / "envs" / "assets" / "point")
 
 
-class PointMazeWays(gym.Env):
+class PointMazeWays(ViewedEnv):
     """One task of `ways.TASKS` with LeRobot's raw keys.
 
     `agent_pos` (4,) is the ball's position and velocity, `environment_state` the vectors from the ball to all exits.
@@ -70,49 +59,31 @@ class PointMazeWays(gym.Env):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
+    render_mode = "rgb_array"
 
-    def __init__(self, task: str, view: View | None = None, render_mode: str = "rgb_array") -> None:
-        """Build the simulation; no graphics context is opened before the first image.
-
-        Args:
-            task: key of `ways.TASKS`.
-            view: what to observe; the state by default.
-            render_mode: only `rgb_array`.
-
-        Raises:
-            ValueError: if the task is not known.
-        """
-        self.view = view or View()
-        self.spec_of_task = get_task(task)
-        self.task = task
-        self.task_description = self.spec_of_task.description
-        self.render_mode = render_mode
+    def __init__(self, task: str, view: View) -> None:
+        """Build the simulation of a key of `ways.TASKS`; no graphics context is opened before the first image."""
+        self.task, self.spec_of_task = task, TASKS[task]
+        self.set_view(view, self.spec_of_task)
         self.point = build_point(self.spec_of_task)
-        self.scene_renderer = SceneRenderer()
-        spaces: dict[str, gym.Space] = {
-            AGENT_POS: unbounded(AGENT_POS_DIM),
-            ENVIRONMENT_STATE: unbounded(self.spec_of_task.environment_state_dim),
-            PIXELS: image_space(*self.view.observation_size),
-        }
-        self.observation_space = gym.spaces.Dict({key: spaces[key] for key in self._keys})
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (ACTION_DIM,), dtype=np.float32)
-        self.state: dict[str, np.ndarray] = {}
-        """`agent_pos` and `environment_state` of the last observation, also where `view` shows images: for experts."""
+        self.main_camera = self._camera_from_above()
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (self.spec_of_task.action_dim,), dtype=np.float32)
 
-    @property
-    def _keys(self) -> tuple[str, ...]:
-        return OBSERVED_KEYS[self.view.obs_type]
+    def _camera_from_above(self) -> mujoco.MjvCamera:
+        camera = mujoco.MjvCamera()
+        camera.elevation, camera.azimuth = -90, 90
+        camera.distance = 1.25 * max(len(self.spec_of_task.maze), len(self.spec_of_task.maze[0]))
+        return camera
 
-    def _observe(self) -> dict[str, np.ndarray]:
+    def scene(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """Model and data of the simulation."""
+        return self.point.model, self.point.data
+
+    def _observe(self) -> dict[str, Any]:
         position, velocity = self.point.data.qpos, self.point.data.qvel
-        self.state = {
-            AGENT_POS: np.concatenate([position, velocity], dtype=np.float32),
-            ENVIRONMENT_STATE: (self.spec_of_task.exits - position).astype(np.float32).ravel(),
-        }
-        observation = {key: value for key, value in self.state.items() if key in self._keys}
-        if PIXELS in self._keys:
-            observation[PIXELS] = self._image(self.view.observation_size)
-        return observation
+        return self.observe(
+            np.concatenate([position, velocity]), (self.spec_of_task.exits - position).ravel()
+        )
 
     @property
     def is_success(self) -> bool:
@@ -136,18 +107,7 @@ class PointMazeWays(gym.Env):
         success = self.is_success
         return self._observe(), float(success), success, False, {"is_success": success}
 
-    def render(self) -> np.ndarray:
-        """Frame of `view.visualization_size`, seen from above."""
-        return self._image(self.view.visualization_size)
-
-    def _image(self, size: tuple[int, int]) -> np.ndarray:
-        camera = mujoco.MjvCamera()
-        camera.elevation, camera.azimuth = -90, 90
-        extent = max(len(self.spec_of_task.maze), len(self.spec_of_task.maze[0]))
-        camera.distance = 1.25 * extent
-        return self.scene_renderer.render(self.point.model, self.point.data, camera, size)
-
     def close(self) -> None:
         """Free the graphics contexts and the simulation."""
-        self.scene_renderer.close()
+        super().close()
         self.point.close()

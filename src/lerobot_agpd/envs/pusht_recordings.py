@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_agpd.envs.base import require_packages
 from lerobot_agpd.envs.images import read_images
+from lerobot_agpd.envs.packages import require_packages
 
 Arrays = dict[str, np.ndarray]
 

@@ -1,64 +1,124 @@
-"""Images of a MuJoCo scene, from MuJoCo's own renderer, at several sizes.
+"""What a simulation shows: its raw observations, and images from MuJoCo's own renderer at several sizes.
 
 gymnasium's renderer draws several environments of one process into each other. robosuite's opens its graphics context
 when the environment is built, needs it for every reset and delivers images upside down. Here a context is opened at
 the first image of a size, and each is made current before use.
 """
 
+from abc import abstractmethod
+from typing import Any
+
+import gymnasium as gym
 import mujoco
 import numpy as np
 
+from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS, TaskSpec, View
+
+type Camera = mujoco.MjvCamera | int | str
+"""A camera, or the number or name of one of the model's."""
+
 
 class SceneRenderer:
-    """Renders scenes of one model."""
+    """Renders scenes of one model.
 
-    def __init__(self, shadows: bool = True, hidden_group: int | None = None) -> None:
+    Attributes:
+        renderers: one per size of image that has been rendered, with a graphics context each.
+    """
+
+    def __init__(self, shadows: bool, hidden_group: int | None) -> None:
         """Open no graphics context yet.
 
         Args:
-            shadows: whether to draw shadows; without a GPU they take most of the time.
+            shadows: whether to draw shadows.
             hidden_group: group of geometry that is not drawn.
         """
         self._shadows = shadows
         self._option = mujoco.MjvOption()
         if hidden_group is not None:
             self._option.geomgroup[hidden_group] = 0
-        self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
-
-    @property
-    def is_open(self) -> bool:
-        """Whether an image has been rendered."""
-        return bool(self._renderers)
+        self.renderers: dict[tuple[int, int], mujoco.Renderer] = {}
 
     def render(
-        self,
-        model: mujoco.MjModel,
-        data: mujoco.MjData,
-        camera: mujoco.MjvCamera | int | str,
-        size: tuple[int, int],
+        self, model: mujoco.MjModel, data: mujoco.MjData, camera: Camera, size: tuple[int, int]
     ) -> np.ndarray:
         """Render the current state.
 
         Args:
             model: the same model as at the last call; for another one, `close` first.
             data: state of the simulation.
-            camera: a camera, or the number or name of one of the model's.
+            camera: where to look from.
             size: height and width, pixels.
 
         Returns:
             (height, width, 3) uint8.
         """
-        if size not in self._renderers:
+        if size not in self.renderers:
             buffer = model.vis.global_
             buffer.offheight, buffer.offwidth = max(buffer.offheight, size[0]), max(buffer.offwidth, size[1])
-            self._renderers[size] = mujoco.Renderer(model, *size)
-            self._renderers[size].scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._shadows
-        renderer = self._renderers[size]
+            self.renderers[size] = mujoco.Renderer(model, *size)
+            self.renderers[size].scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._shadows
+        renderer = self.renderers[size]
         renderer.update_scene(data, camera, self._option)
         return renderer.render()
 
     def close(self) -> None:
         """Free the graphics contexts; the next image opens one again."""
-        for renderer in self._renderers.values():
+        for renderer in self.renderers.values():
             renderer.close()
-        self._renderers.clear()
+        self.renderers.clear()
+
+
+class ViewedEnv(gym.Env):
+    """A simulation that shows what a view says.
+
+    Attributes:
+        view: what is shown.
+        state: `agent_pos` and `environment_state` of the last observation, whatever the view shows: for experts.
+        main_camera: camera of rendered frames, and of an observed image without a name.
+        task_description: one sentence, for LeRobot.
+    """
+
+    view: View
+    state: dict[str, np.ndarray]
+    main_camera: Camera = "top"
+    task_description: str
+
+    def set_view(self, view: View, spec: TaskSpec, hidden_group: int | None = None) -> None:
+        """Declare the observations of a task; `hidden_group` of the model's geometry is in no image."""
+        self.view, self.state = view, {}
+        self.task_description = spec.description
+        self.scene_renderer = SceneRenderer(view.shadows, hidden_group)
+        image = gym.spaces.Box(0, 255, (*view.observation_size, 3), np.uint8)
+        spaces: dict[str, gym.Space] = {
+            AGENT_POS: gym.spaces.Box(-np.inf, np.inf, (spec.agent_pos_dim,), np.float32),
+            ENVIRONMENT_STATE: gym.spaces.Box(-np.inf, np.inf, (spec.environment_state_dim,), np.float32),
+            PIXELS: gym.spaces.Dict(dict.fromkeys(view.cameras, image)) if view.cameras else image,
+        }
+        self.observation_space = gym.spaces.Dict({key: spaces[key] for key in view.keys})
+
+    def observe(self, agent_pos: np.ndarray, environment_state: np.ndarray) -> dict[str, Any]:
+        """Return the raw observation: float32 vectors, and images (height, width, 3) in uint8 if the view has any."""
+        vectors = {AGENT_POS: agent_pos, ENVIRONMENT_STATE: environment_state}
+        self.state = {key: vector.astype(np.float32) for key, vector in vectors.items()}
+        observation: dict[str, Any] = {key: self.state[key] for key in self.view.keys if key != PIXELS}
+        if PIXELS in self.view.keys:
+            size = self.view.observation_size
+            images = {camera: self._image(camera, size) for camera in self.view.cameras}
+            observation[PIXELS] = images or self._image(self.main_camera, size)
+        return observation
+
+    def render(self) -> np.ndarray:
+        """Render a frame (height, width, 3) of the main camera."""
+        return self._image(self.main_camera, self.view.visualization_size)
+
+    def _image(self, camera: Camera, size: tuple[int, int]) -> np.ndarray:
+        return self.scene_renderer.render(*self.scene(), camera, size)
+
+    @abstractmethod
+    def scene(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """Model and data of the simulation, as they shall be drawn."""
+
+    def close(self) -> None:
+        """Free the graphics contexts and the simulation."""
+        self.scene_renderer.close()
+        super().close()

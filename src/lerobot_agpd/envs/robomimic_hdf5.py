@@ -22,13 +22,13 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
-from lerobot_agpd.envs.base import require_packages
+from lerobot_agpd.envs.packages import require_packages
 
 Array = np.ndarray
 
@@ -42,7 +42,7 @@ NO_OBSERVATIONS = (
 )
 
 
-class RobomimicFile:
+class RobomimicFile(AbstractContextManager["RobomimicFile"]):
     """A robomimic dataset, open for reading.
 
     Attributes:
@@ -69,7 +69,7 @@ class RobomimicFile:
         try:
             self._file = h5py.File(path, "r")
         except OSError as error:
-            kind = "truncated or damaged" if _has_signature(path) else "not an HDF5 file"
+            kind = "truncated or damaged" if h5py.is_hdf5(path) else "not an HDF5 file"
             raise ValueError(f"{path} is {kind}: {error}") from error
         self.env_args = self._env_args()
         self.data = self._file["data"]
@@ -84,12 +84,7 @@ class RobomimicFile:
         masks = self._file.get("mask", {})
         self.masks = {key: [name.decode() for name in masks[key][()]] for key in sorted(masks)}
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._file.close()
 
     def _env_args(self) -> dict[str, Any]:
@@ -139,27 +134,24 @@ class RobomimicFile:
             ValueError: naming the flag, if the file has no such demonstration or mask.
         """
         if filter_key is not None:
+            chosen = set(self.masks.get(filter_key, ()))
+            problem = None
             if filter_key not in self.masks:
-                raise ValueError(
-                    f"--filter_key={filter_key}: {self.path} has the masks {list(self.masks) or 'none'}"
-                )
-            absent = sorted(set(self.masks[filter_key]) - set(self.demos))
-            if absent:
-                raise ValueError(f"--filter_key={filter_key} names {absent}, which {self.path} does not hold")
-            if not self.masks[filter_key]:
-                raise ValueError(
-                    f"--filter_key={filter_key}: this mask of {self.path} selects no demonstration"
-                )
-            return [demo for demo in self.demos if demo in set(self.masks[filter_key])]
-        if episodes is None:
-            return list(self.demos)
-        outside = [episode for episode in episodes if not 0 <= episode < len(self.demos)]
+                problem = f"{self.path} has the masks {list(self.masks) or 'none'}"
+            elif absent := sorted(chosen - set(self.demos)):
+                problem = f"this mask names {absent}, which {self.path} does not hold"
+            elif not chosen:
+                problem = f"this mask of {self.path} selects no demonstration"
+            if problem:
+                raise ValueError(f"--filter_key={filter_key}: {problem}")
+            return [demo for demo in self.demos if demo in chosen]
+        n_demos = len(self.demos)
+        outside = [episode for episode in episodes or () if not 0 <= episode < n_demos]
         if outside:
             raise ValueError(
-                f"--episodes={outside}: {self.path} has {len(self.demos)} demonstrations, "
-                f"0 to {len(self.demos) - 1}"
+                f"--episodes={outside}: {self.path} has {n_demos} demonstrations, 0 to {n_demos - 1}"
             )
-        return [self.demos[episode] for episode in episodes]
+        return self.demos if episodes is None else [self.demos[episode] for episode in episodes]
 
     def observation_shapes(self, demo: str) -> dict[str, tuple[int, ...]]:
         """Shape of one step of every observation of a demonstration.
@@ -230,19 +222,19 @@ class RobomimicFile:
                 )
         return values
 
+    def model_xml(self, demo: str) -> str | None:
+        """MuJoCo model of a demonstration; None if the file has none.
+
+        `RobosuiteEnv.reset_to(file.read(demo, "states")[0], file.model_xml(demo))` puts the simulator where the actions
+        began. Without the model a replay of lift ends up millimeters off: robosuite draws the cube's size when it builds
+        a model.
+        """
+        model: str | None = self.data[demo].attrs.get("model_file")
+        return model
+
     def is_replayable(self, demo: str) -> bool:
         """Whether a demonstration has simulator states and the model that they belong to."""
-        return "states" in self.data[demo] and "model_file" in self.data[demo].attrs
-
-    def model_sha256(self, demo: str) -> str | None:
-        """SHA-256 of a demonstration's MuJoCo model; None if it has none."""
-        model = self.data[demo].attrs.get("model_file")
-        return None if model is None else hashlib.sha256(model.encode()).hexdigest()
-
-
-def _has_signature(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(8) == b"\x89HDF\r\n\x1a\n"
+        return "states" in self.data[demo] and self.model_xml(demo) is not None
 
 
 def sha256(path: Path) -> str:

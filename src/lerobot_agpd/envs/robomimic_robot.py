@@ -7,6 +7,7 @@ another frame of reference or another rate.
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -29,16 +30,14 @@ def check_robot(file: RobomimicFile, task: RobomimicTask) -> None:
     kwargs = file.env_args["env_kwargs"]
     robots = kwargs.get("robots", ROBOT)
     robots = [robots] * task.n_robots if isinstance(robots, str) else list(robots)
-    differences = []
-    if robots != [ROBOT] * task.n_robots:
-        differences.append(f"robots {robots} (expected {[ROBOT] * task.n_robots})")
+    expected, differences = [ROBOT] * task.n_robots, []
+    if robots != expected:
+        differences.append(f"robots {robots} (expected {expected})")
     if file.fps != FPS:
         differences.append(f"control_freq {file.fps} (expected {FPS})")
-    controllers = _arm_controllers(kwargs.get("controller_configs"))
+    controllers = list(_arm_controllers(kwargs.get("controller_configs")))
     if not controllers:
-        logger.warning(
-            "%s does not say which controller its actions are for: %s is assumed", file.path, "OSC_POSE"
-        )
+        logger.warning("%s does not name the controller of its actions: OSC_POSE is assumed", file.path)
     for controller in controllers:
         differences += [
             f"controller {key} {controller[key]} (expected {ARM_CONTROLLER[key]})"
@@ -52,21 +51,18 @@ def check_robot(file: RobomimicFile, task: RobomimicTask) -> None:
         )
 
 
-def _arm_controllers(config: Any) -> list[dict[str, Any]]:
+def _arm_controllers(config: Any) -> Iterator[dict[str, Any]]:
     """Settings of every arm's controller, in robosuite 1.5's words; one config is for all robots.
 
     robosuite 1.5 nests them by body part (a Panda's only arm is the right one); 1.4 has them at the top, and says
     `control_delta` for `input_type`.
     """
-    if isinstance(config, list):
-        return [controller for each in config for controller in _arm_controllers(each)]
-    if not config:
-        return []
-    parts = config.get("body_parts", {"right": config})
-    controller = dict(parts.get("arms", parts).get("right", {}))
-    if "control_delta" in controller:
-        controller["input_type"] = "delta" if controller["control_delta"] else "absolute"
-    return [controller] if controller else []
+    for each in filter(None, config if isinstance(config, list) else [config]):
+        parts = each.get("body_parts", {"right": each})
+        if controller := dict(parts.get("arms", parts).get("right", {})):
+            if "control_delta" in controller:
+                controller["input_type"] = "delta" if controller["control_delta"] else "absolute"
+            yield controller
 
 
 def _same(value: Any, expected: Any) -> bool:

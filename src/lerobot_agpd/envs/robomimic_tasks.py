@@ -10,7 +10,7 @@ Horizons and cameras are robomimic's (v0.5.0: `robomimic/__init__.py` and
 from dataclasses import dataclass
 from typing import Any
 
-from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS
+from lerobot_agpd.envs.base import TaskSpec
 
 FPS = 20
 """Control steps per second of simulated time (`control_freq`)."""
@@ -49,13 +49,6 @@ ARM_ACTION_DIM = 7
 ARM_KEYS = ("eef_pos", "eef_quat", "gripper_qpos")
 """Observables of an arm for robomimic's low-dimensional policies, in its order, without the prefix `robot0_` or `robot1_`."""
 
-OBSERVED_KEYS: dict[str, tuple[str, ...]] = {
-    "state": (AGENT_POS, ENVIRONMENT_STATE),
-    "pixels_agent_pos": (AGENT_POS, PIXELS),
-    "pixels": (PIXELS,),
-}
-"""Raw keys of every `--env.obs_type`."""
-
 
 def key_dim(key: str) -> int:
     """Length of one observable of robosuite, by its name.
@@ -72,13 +65,12 @@ def key_dim(key: str) -> int:
     return 1
 
 
-@dataclass(frozen=True)
-class RobomimicTask:
-    """Properties of one task.
+@dataclass(frozen=True, kw_only=True)
+class RobomimicTask(TaskSpec):
+    """Properties of one task; the defaults are those of one arm.
 
     Attributes:
         robosuite_name: robosuite's name of the environment.
-        description: one sentence, LeRobot's `task_description`.
         object_keys: robosuite 1.5's observables that make up `environment_state`, in order; robomimic's files
             `*_v15.hdf5` hold their concatenation as `obs/object`.
         object_keys_v141: the same in the order of robosuite 1.4.1, which is that of the files `*_v141.hdf5`.
@@ -86,52 +78,37 @@ class RobomimicTask:
         more_cameras: further ones that the model has.
         episode_length: robomimic's horizon of a rollout for its proficient-human data, steps.
         n_robots: number of Pandas.
-        negated_in_v141: keys whose sign is the other one in robosuite 1.4.1.
     """
 
     robosuite_name: str
-    description: str
     object_keys: tuple[str, ...]
     object_keys_v141: tuple[str, ...]
     cameras: tuple[str, ...]
     more_cameras: tuple[str, ...]
-    episode_length: int
+    fps: int = FPS
+    episode_length: int = 400
     n_robots: int = 1
-    negated_in_v141: tuple[str, ...] = ()
+    action_dim: int = ARM_ACTION_DIM
+    agent_pos_dim: int = 9
 
     @property
     def agent_keys(self) -> tuple[str, ...]:
         """Observables that make up `agent_pos`, in order: those of `robot0`, then those of `robot1`."""
         return tuple(f"robot{robot}_{key}" for robot in range(self.n_robots) for key in ARM_KEYS)
 
-    @property
-    def agent_pos_dim(self) -> int:
-        """Length of `agent_pos`: 9 per robot."""
-        return sum(map(key_dim, self.agent_keys))
 
-    @property
-    def environment_state_dim(self) -> int:
-        """Length of `environment_state`."""
-        return sum(map(key_dim, self.object_keys))
-
-    @property
-    def action_dim(self) -> int:
-        """Length of an action: 7 per robot."""
-        return ARM_ACTION_DIM * self.n_robots
+def _poses_v141(*names: str) -> tuple[str, ...]:
+    """Poses of objects in the order of robosuite 1.4.1."""
+    suffixes = ("pos", "quat", "to_robot0_eef_pos", "to_robot0_eef_quat")
+    return tuple(f"{name}_{suffix}" for name in names for suffix in suffixes)
 
 
-def _pose_first(name: str) -> tuple[str, ...]:
-    """Order of robosuite 1.4.1."""
-    return (f"{name}_pos", f"{name}_quat", f"{name}_to_robot0_eef_pos", f"{name}_to_robot0_eef_quat")
+def _poses(*names: str) -> tuple[str, ...]:
+    """Poses of objects in the order of robosuite 1.5: the relative pose, which lies in the frame of the hand, first."""
+    suffixes = ("to_robot0_eef_pos", "to_robot0_eef_quat", "pos", "quat")
+    return tuple(f"{name}_{suffix}" for name in names for suffix in suffixes)
 
 
-def _relative_pose_first(name: str) -> tuple[str, ...]:
-    """Order of robosuite 1.5; the relative pose lies in the frame of the hand."""
-    position, rotation, relative_position, relative_rotation = _pose_first(name)
-    return (relative_position, relative_rotation, position, rotation)
-
-
-_CUBE = ("cube_pos", "cube_quat", "gripper_to_cube_pos")
 _HANGING_FLAGS = ("frame_is_assembled", "tool_on_frame")
 _TRANSPORT_POSES = (
     *("payload_pos", "payload_quat", "trash_pos", "trash_quat", "lid_handle_pos", "lid_handle_quat"),
@@ -147,65 +124,54 @@ _ROBOT = "robot0_robotview"
 
 TASKS: dict[str, RobomimicTask] = {
     "lift": RobomimicTask(
-        robosuite_name="Lift",
         description="Lift the cube.",
-        object_keys=_CUBE,
-        object_keys_v141=_CUBE,
+        robosuite_name="Lift",
+        environment_state_dim=10,
+        object_keys=("cube_pos", "cube_quat", "gripper_to_cube_pos"),
+        object_keys_v141=("cube_pos", "cube_quat", "gripper_to_cube_pos"),  # the last of opposite sign
         cameras=("agentview", _EYE),
         more_cameras=("frontview", "birdview", "sideview", _ROBOT),
-        episode_length=400,
-        negated_in_v141=("gripper_to_cube_pos",),
     ),
     "can": RobomimicTask(
-        robosuite_name="PickPlaceCan",
         description="Put the can into its compartment of the other bin.",
-        object_keys=_relative_pose_first("Can"),
-        object_keys_v141=_pose_first("Can"),
+        robosuite_name="PickPlaceCan",
+        environment_state_dim=14,
+        object_keys=_poses("Can"),
+        object_keys_v141=_poses_v141("Can"),
         cameras=("agentview", _EYE),
         more_cameras=("frontview", "birdview", _ROBOT),
-        episode_length=400,
     ),
     "square": RobomimicTask(
-        robosuite_name="NutAssemblySquare",
         description="Put the square nut onto the square peg.",
-        object_keys=_relative_pose_first("SquareNut"),
-        object_keys_v141=_pose_first("SquareNut"),
+        robosuite_name="NutAssemblySquare",
+        environment_state_dim=14,
+        object_keys=_poses("SquareNut"),
+        object_keys_v141=_poses_v141("SquareNut"),
         cameras=("agentview", _EYE),
         more_cameras=("frontview", "birdview", "sideview", _ROBOT),
-        episode_length=400,
     ),
     "transport": RobomimicTask(
-        robosuite_name="TwoArmTransport",
         description="Hand the hammer from bin to bin and clear the trash out of its way.",
+        robosuite_name="TwoArmTransport",
+        n_robots=2,
+        action_dim=14,
+        agent_pos_dim=18,
+        environment_state_dim=41,
         object_keys=(*_TRANSPORT_POSES, *_TRANSPORT_FLAGS, *_TRANSPORT_VECTORS),
         object_keys_v141=(*_TRANSPORT_POSES, *_TRANSPORT_VECTORS, *_TRANSPORT_FLAGS),
         cameras=("shouldercamera0", "shouldercamera1", _EYE, "robot1_eye_in_hand"),
         more_cameras=("frontview", "birdview", "agentview", "sideview", _ROBOT, "robot1_robotview"),
         episode_length=700,
-        n_robots=2,
     ),
     "tool_hang": RobomimicTask(
-        robosuite_name="ToolHang",
         description="Assemble the frame on the stand and hang the tool on it.",
-        object_keys=(
-            *(k for n in ("base", "frame", "tool") for k in _relative_pose_first(n)),
-            *_HANGING_FLAGS,
-        ),
-        object_keys_v141=(*(k for n in ("base", "frame", "tool") for k in _pose_first(n)), *_HANGING_FLAGS),
+        robosuite_name="ToolHang",
+        environment_state_dim=44,
+        object_keys=(*_poses("base", "frame", "tool"), *_HANGING_FLAGS),
+        object_keys_v141=(*_poses_v141("base", "frame", "tool"), *_HANGING_FLAGS),
         cameras=("sideview", _EYE),
         more_cameras=("frontview", "birdview", "agentview", _ROBOT),
         episode_length=700,
     ),
 }
 """`--env.task` to its description."""
-
-
-def get_task(task: str | None) -> RobomimicTask:
-    """Look a task up in `TASKS`.
-
-    Raises:
-        ValueError: if the task is not known.
-    """
-    if task not in TASKS:
-        raise ValueError(f"--env.task must be one of {', '.join(TASKS)}; got {task!r}.")
-    return TASKS[task]

@@ -7,15 +7,15 @@ false; true gives the same numbers, bit for bit, in less time.
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 
-from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS, image_space, unbounded
-from lerobot_agpd.envs.rendering import SceneRenderer
-from lerobot_agpd.envs.robomimic_tasks import ARM_CONTROLLER, FPS, OBSERVED_KEYS, ROBOT, get_task
+from lerobot_agpd.envs.base import View
+from lerobot_agpd.envs.rendering import ViewedEnv
+from lerobot_agpd.envs.robomimic_tasks import ARM_CONTROLLER, FPS, ROBOT, TASKS
 
 # robosuite warns at import of optional packages and of a settings file that hardly anybody has. Its logger sets its
 # own level during the import, which only a filter survives.
@@ -30,16 +30,6 @@ MODEL_SEED = 0
 """Seed of the model: robosuite draws parts of it, such as the size of lift's cube, when it is built."""
 
 
-@dataclass(frozen=True)
-class View:
-    """Observed keys and cameras, and sizes of images, (height, width) in pixels."""
-
-    obs_type: str = "state"
-    cameras: tuple[str, ...] = ()
-    observation_size: tuple[int, int] = (84, 84)
-    visualization_size: tuple[int, int] = (480, 480)
-
-
 @contextmanager
 def numpy_seeded(seed: int) -> Iterator[None]:
     """Seed numpy's global generator, from which robosuite 1.5.1 draws, and restore it afterwards."""
@@ -51,48 +41,31 @@ def numpy_seeded(seed: int) -> Iterator[None]:
         np.random.set_state(state)
 
 
-class RobosuiteEnv(gym.Env):
+class RobosuiteEnv(ViewedEnv):
     """One task of `robomimic_tasks.TASKS`.
 
-    Observations are those of the keys that `view.obs_type` asks for: `agent_pos` and `environment_state` as float32
-    vectors, `pixels` as one uint8 image (height, width, 3) per camera. An action holds 7 numbers in [-1, 1] per
-    robot, see `robomimic_tasks.ARM_ACTION_DIM`. The reward is 1 at success, at which the episode terminates, else 0.
-    `info["is_success"]` is a bool after every step and every reset.
+    `agent_pos` and `environment_state` are float32 vectors, `pixels` one uint8 image (height, width, 3) per camera. An
+    action holds 7 numbers in [-1, 1] per robot, see `robomimic_tasks.ARM_ACTION_DIM`. The reward is 1 at success, at
+    which the episode terminates, else 0. `info["is_success"]` is a bool after every step and every reset.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
+    render_mode = "rgb_array"
 
-    def __init__(self, task: str, view: View | None = None, render_mode: str = "rgb_array") -> None:
+    def __init__(self, task: str, view: View | None = None) -> None:
         """Build the simulation; no graphics context is opened before the first image.
 
         Args:
             task: key of `TASKS`.
             view: what to observe; the state by default.
-            render_mode: only `rgb_array`.
-
-        Raises:
-            ValueError: if the task is not known.
         """
-        self.view = view or View()
-        self.spec_of_task = get_task(task)
-        self.task = task
-        self.task_description = self.spec_of_task.description
-        self.render_mode = render_mode
+        self.task, self.spec_of_task = task, TASKS[task]
         with numpy_seeded(MODEL_SEED):
             self.simulation = self._build()
-        self.scene_renderer = SceneRenderer(hidden_group=COLLISION_GROUP)
-        self._has_foreign_model = False
-        spaces: dict[str, gym.Space] = {
-            AGENT_POS: unbounded(self.spec_of_task.agent_pos_dim),
-            ENVIRONMENT_STATE: unbounded(self.spec_of_task.environment_state_dim),
-            PIXELS: gym.spaces.Dict(
-                {camera: image_space(*self.view.observation_size) for camera in self.view.cameras}
-            ),
-        }
-        self.observation_space = gym.spaces.Dict({key: spaces[key] for key in self._keys})
+        self.set_view(view or View(), self.spec_of_task, hidden_group=COLLISION_GROUP)
+        self.main_camera = self.spec_of_task.cameras[0]
         self.action_space = gym.spaces.Box(-1.0, 1.0, (self.spec_of_task.action_dim,), dtype=np.float32)
-        self.state: dict[str, np.ndarray] = {}
-        """`agent_pos` and `environment_state` of the last observation, also where `view` shows images: for experts."""
+        self._has_foreign_model = False
 
     def _build(self) -> Any:
         controller = {"type": "BASIC", "body_parts": {"right": ARM_CONTROLLER}}
@@ -112,26 +85,15 @@ class RobosuiteEnv(gym.Env):
             renderer="mujoco",
         )
 
-    @property
-    def _keys(self) -> tuple[str, ...]:
-        return OBSERVED_KEYS[self.view.obs_type]
-
-    def _observe(self) -> dict[str, Any]:
+    def _read(self) -> dict[str, Any]:
         """Read the sensors once, now; robosuite's own clock of them drifts.
 
         A reading of can, square and tool_hang computes the relative pose from where the object was at the reading
         before. So do robomimic's data, which were read once per control step: see `step`.
         """
         raw = self.simulation._get_observations(force_update=True)
-        self.state = {
-            AGENT_POS: np.concatenate([raw[key] for key in self.spec_of_task.agent_keys], dtype=np.float32),
-            ENVIRONMENT_STATE: raw["object-state"].astype(np.float32),
-        }
-        observation: dict[str, Any] = {key: value for key, value in self.state.items() if key in self._keys}
-        if PIXELS in self._keys:
-            size = self.view.observation_size
-            observation[PIXELS] = {camera: self._image(camera, size) for camera in self.view.cameras}
-        return observation
+        agent_pos = np.concatenate([raw[key] for key in self.spec_of_task.agent_keys])
+        return self.observe(agent_pos, raw["object-state"])
 
     @property
     def is_success(self) -> bool:
@@ -162,7 +124,7 @@ class RobosuiteEnv(gym.Env):
             resting_posture = sim.data.qpos[robot._ref_arm_joint_pos_indexes]
             robot.part_controllers["right"].update_initial_joints(resting_posture)
         self.simulation._update_observables(force=True)
-        return self._observe(), {"is_success": self.is_success}
+        return self._read(), {"is_success": self.is_success}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """One control step of 50 ms."""
@@ -170,7 +132,7 @@ class RobosuiteEnv(gym.Env):
         _, reward, _, _ = self.simulation.step(np.asarray(action, dtype=np.float64))
         self.simulation._obs_cache.update(last_reading)  # forget readings within the step
         success = self.is_success
-        return self._observe(), float(reward), success, False, {"is_success": success}
+        return self._read(), float(reward), success, False, {"is_success": success}
 
     def get_state(self) -> np.ndarray:
         """Return MuJoCo's state (1 + nq + nv,): time, positions, velocities; robomimic's HDF5 `states`."""
@@ -217,15 +179,11 @@ class RobosuiteEnv(gym.Env):
         self.simulation.hard_reset = False
         self._has_foreign_model = False
 
-    def render(self) -> np.ndarray:
-        """Frame of `view.visualization_size` from the first of robomimic's cameras for the task."""
-        return self._image(self.spec_of_task.cameras[0], self.view.visualization_size)
-
-    def _image(self, camera: str, size: tuple[int, int]) -> np.ndarray:
-        sim = self.simulation.sim
-        return self.scene_renderer.render(sim.model._model, sim.data._data, camera, size)
+    def scene(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """Model and data of the simulation."""
+        return self.simulation.sim.model._model, self.simulation.sim.data._data
 
     def close(self) -> None:
         """Free the graphics contexts and the simulation."""
-        self.scene_renderer.close()
+        super().close()
         self.simulation.close()

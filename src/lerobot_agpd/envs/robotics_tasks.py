@@ -4,88 +4,45 @@ A new task is one more entry in `TASKS` (which numbers of its observation belong
 and what success means) and in `gymnasium_robotics.Task`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS
+from lerobot_agpd.envs.base import TaskSpec
 
 RawObservation = np.ndarray | dict[str, Any]
 Success = Callable[[Any, RawObservation, dict[str, Any]], bool]
 
-OBSERVED_KEYS: dict[str, tuple[str, ...]] = {
-    "state": (AGENT_POS, ENVIRONMENT_STATE),
-    "pixels": (PIXELS,),
-    "pixels_agent_pos": (AGENT_POS, PIXELS),
-}
-"""Raw keys of every `--env.obs_type`."""
 
-
-@dataclass(frozen=True)
-class ObservationLayout:
-    """Where the entries of a flat observation go.
+@dataclass(frozen=True, kw_only=True)
+class RoboticsTask(TaskSpec):
+    """Properties of one task; actions lie in [-1, 1].
 
     Attributes:
-        agent_pos: indices into the flat observation that make up `agent_pos`, in order.
-        environment_state: indices that make up `environment_state`.
-        goal_dim: length of the desired goal that is appended to them; 0 for a task without one.
+        agent: indices into the flat observation that make up `agent_pos`, in order.
+        scene: indices that make up `environment_state`.
+        success: of the unwrapped environment, the raw observation and the info of a step or a reset.
+        goal_dim: length of the desired goal that is appended to `environment_state`; 0 for a task without one.
     """
 
-    agent_pos: tuple[int, ...]
-    environment_state: tuple[int, ...]
+    agent: Sequence[int]
+    scene: Sequence[int]
+    success: Success
     goal_dim: int = 0
 
-    @property
-    def agent_pos_dim(self) -> int:
-        """Length of `agent_pos`."""
-        return len(self.agent_pos)
-
-    @property
-    def environment_state_dim(self) -> int:
-        """Length of `environment_state`, the desired goal included."""
-        return len(self.environment_state) + self.goal_dim
-
-    def split(self, observation: RawObservation) -> dict[str, np.ndarray]:
-        """Turn one observation into LeRobot's raw keys.
+    def split(self, observation: RawObservation) -> tuple[np.ndarray, np.ndarray]:
+        """Split one observation into `agent_pos` (agent_pos_dim,) and `environment_state` (environment_state_dim,).
 
         Args:
             observation: flat (D,), or a goal dictionary with `observation` (D,) and `desired_goal` (goal_dim,).
-
-        Returns:
-            `agent_pos` (agent_pos_dim,) and `environment_state` (environment_state_dim,), both float32.
         """
-        flat = observation["observation"] if isinstance(observation, dict) else observation
-        scene = flat[list(self.environment_state)]
-        if self.goal_dim:
-            assert isinstance(observation, dict)
-            scene = np.concatenate([scene, observation["desired_goal"]])
-        return {
-            AGENT_POS: flat[list(self.agent_pos)].astype(np.float32),
-            ENVIRONMENT_STATE: scene.astype(np.float32),
-        }
-
-
-@dataclass(frozen=True)
-class TaskSpec:
-    """Properties of one task.
-
-    Attributes:
-        description: one sentence, LeRobot's `task_description`.
-        layout: how its observation is split.
-        action_dim: length of an action; actions lie in [-1, 1].
-        fps: control steps per second of simulated time, rounded down.
-        episode_length: Gymnasium-Robotics' own limit in steps.
-        success: of the unwrapped environment, the raw observation and the info of a step or a reset.
-    """
-
-    description: str
-    layout: ObservationLayout
-    action_dim: int
-    fps: int
-    episode_length: int
-    success: Success
+        if not isinstance(observation, dict):
+            observation = {"observation": observation}
+        flat = observation["observation"]
+        goal = observation["desired_goal"] if self.goal_dim else []
+        return flat[list(self.agent)], np.concatenate([flat[list(self.scene)], goal])
 
 
 def _goal_reached(env: Any, observation: RawObservation, info: dict[str, Any]) -> bool:
@@ -104,66 +61,44 @@ def _all_tasks_done(env: Any, observation: RawObservation, info: dict[str, Any])
     return set(env.goal) <= set(info["episode_task_completions"])
 
 
+def _fetch(description: str, agent: Sequence[int], scene: Sequence[int]) -> RoboticsTask:
+    return RoboticsTask(
+        description=description,
+        fps=25,
+        episode_length=50,
+        action_dim=4,
+        agent_pos_dim=len(agent),
+        environment_state_dim=len(scene) + 3,
+        agent=agent,
+        scene=scene,
+        goal_dim=3,
+        success=_goal_reached,
+    )
+
+
+def _adroit(description: str, agent: Sequence[int], dim: int, action_dim: int) -> RoboticsTask:
+    """Of an observation (dim,), all that is not the hand's belongs to the scene."""
+    return RoboticsTask(
+        description=description,
+        fps=100,
+        episode_length=200,
+        action_dim=action_dim,
+        agent_pos_dim=len(agent),
+        environment_state_dim=dim - len(agent),
+        agent=agent,
+        scene=sorted(set(range(dim)) - set(agent)),
+        success=_adroit_success,
+    )
+
+
 # Grip position (3), finger displacements (2), grip velocity (3), finger velocities (2): an arm alone has these only.
-_FETCH_ARM = ObservationLayout(agent_pos=tuple(range(10)), environment_state=(), goal_dim=3)
+_ARM = (range(10), ())
 # With an object, its position (3:6), position from the grip (6:9), rotation (11:14), velocity from the grip (14:17)
 # and angular velocity (17:20) lie between them.
-_FETCH_OBJECT = ObservationLayout(
-    agent_pos=(0, 1, 2, 9, 10, 20, 21, 22, 23, 24),
-    environment_state=(*range(3, 9), *range(11, 20)),
-    goal_dim=3,
-)
-
-
-def _fetch(description: str, layout: ObservationLayout) -> TaskSpec:
-    return TaskSpec(description, layout, 4, 25, 50, _goal_reached)
-
-
-def _adroit(
-    description: str, agent: tuple[int, ...], dim: int, action_dim: int, episode_length: int = 200
-) -> TaskSpec:
-    """Of an observation (dim,), all that is not the hand's belongs to the scene."""
-    scene = tuple(index for index in range(dim) if index not in agent)
-    layout = ObservationLayout(agent_pos=agent, environment_state=scene)
-    return TaskSpec(description, layout, action_dim, 100, episode_length, _adroit_success)
-
-
-TASKS: dict[str, TaskSpec] = {
-    "FetchReach-v4": _fetch("Move the gripper to the target position.", _FETCH_ARM),
-    "FetchPush-v4": _fetch("Push the block to the target position on the table.", _FETCH_OBJECT),
-    "FetchPickAndPlace-v4": _fetch("Pick up the block and bring it to the target position.", _FETCH_OBJECT),
-    "FetchSlide-v4": _fetch("Hit the puck so that it slides to the target position.", _FETCH_OBJECT),
-    # Arm, wrist and finger joints, and the position of the palm where it is observed; relocate observes the palm
-    # only from the ball and from the target.
-    "AdroitHandDoor-v1": _adroit(
-        "Undo the latch and swing the door open.", (*range(27), *range(29, 32)), dim=39, action_dim=28
-    ),
-    "AdroitHandHammer-v1": _adroit(
-        "Pick up the hammer and drive the nail into the board.",
-        (*range(26), *range(33, 36)),
-        dim=46,
-        action_dim=26,
-    ),
-    "AdroitHandPen-v1": _adroit(
-        "Turn the pen in the hand to the target orientation.", tuple(range(24)), dim=45, action_dim=24
-    ),
-    "AdroitHandRelocate-v1": _adroit(
-        "Pick up the ball and move it to the target position.", tuple(range(30)), dim=39, action_dim=30
-    ),
-    # Joint positions (9) and velocities (9); then positions (21) and velocities (20) of everything that moves. The
-    # goal is the same in every episode and left out: as a constant it would say nothing. 12.5 steps per second.
-    "FrankaKitchen-v1": TaskSpec(
-        description="Complete the kitchen tasks.",
-        layout=ObservationLayout(agent_pos=tuple(range(18)), environment_state=tuple(range(18, 59))),
-        action_dim=9,
-        fps=12,
-        episode_length=280,
-        success=_all_tasks_done,
-    ),
-}
+_ARM_AND_OBJECT = ((0, 1, 2, 9, 10, 20, 21, 22, 23, 24), (*range(3, 9), *range(11, 20)))
 
 KITCHEN = "FrankaKitchen-v1"
-KitchenTask = Literal[
+KITCHEN_TASKS = (
     "bottom burner",
     "top burner",
     "light switch",
@@ -171,17 +106,45 @@ KitchenTask = Literal[
     "hinge cabinet",
     "microwave",
     "kettle",
-]
-KITCHEN_DEFAULT: tuple[KitchenTask, ...] = ("microwave", "kettle", "light switch", "slide cabinet")
+)
+KITCHEN_DEFAULT = ("microwave", "kettle", "light switch", "slide cabinet")
 """The four of D4RL's `kitchen-complete` (arXiv:2004.07219)."""
 
-
-def get_task(task: str | None) -> TaskSpec:
-    """Look a task up in `TASKS`.
-
-    Raises:
-        ValueError: if the task is unknown.
-    """
-    if task not in TASKS:
-        raise ValueError(f"--env.task must be one of {', '.join(TASKS)}; got {task!r}.")
-    return TASKS[task]
+TASKS: dict[str, RoboticsTask] = {
+    "FetchReach-v4": _fetch("Move the gripper to the target position.", *_ARM),
+    "FetchPush-v4": _fetch("Push the block to the target position on the table.", *_ARM_AND_OBJECT),
+    "FetchPickAndPlace-v4": _fetch(
+        "Pick up the block and bring it to the target position.", *_ARM_AND_OBJECT
+    ),
+    "FetchSlide-v4": _fetch("Hit the puck so that it slides to the target position.", *_ARM_AND_OBJECT),
+    # Arm, wrist and finger joints, and the position of the palm where it is observed; relocate observes the palm
+    # only from the ball and from the target.
+    "AdroitHandDoor-v1": _adroit(
+        "Undo the latch and swing the door open.", [*range(27), *range(29, 32)], dim=39, action_dim=28
+    ),
+    "AdroitHandHammer-v1": _adroit(
+        "Pick up the hammer and drive the nail into the board.",
+        [*range(26), *range(33, 36)],
+        dim=46,
+        action_dim=26,
+    ),
+    "AdroitHandPen-v1": _adroit(
+        "Turn the pen in the hand to the target orientation.", range(24), dim=45, action_dim=24
+    ),
+    "AdroitHandRelocate-v1": _adroit(
+        "Pick up the ball and move it to the target position.", range(30), dim=39, action_dim=30
+    ),
+    # Joint positions (9) and velocities (9); then positions (21) and velocities (20) of everything that moves. The
+    # goal is the same in every episode and left out: as a constant it would say nothing. 12.5 steps per second.
+    KITCHEN: RoboticsTask(
+        description="Complete the kitchen tasks.",
+        fps=12,
+        episode_length=280,
+        action_dim=9,
+        agent_pos_dim=18,
+        environment_state_dim=41,
+        agent=range(18),
+        scene=range(18, 59),
+        success=_all_tasks_done,
+    ),
+}

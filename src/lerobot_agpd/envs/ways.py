@@ -12,6 +12,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_agpd.envs.base import TaskSpec
+
 Array = NDArray[np.float64]
 Points = tuple[tuple[float, float], ...]
 
@@ -19,29 +21,27 @@ FPS = 10
 """Control steps per second: ten of PointMaze's steps of 10 ms each. A chunk of eight actions then lasts long enough
 to decide which way the ball goes."""
 
-AGENT_POS_DIM, ACTION_DIM = 4, 2
-
 WALL, START, EXIT = "#", "r", "g"
 """Cells of a map; every other cell is free."""
 
 
-@dataclass(frozen=True)
-class WaysTask:
-    """A maze with several ways through it.
+@dataclass(frozen=True, kw_only=True)
+class WaysTask(TaskSpec):
+    """A maze with several ways through it; `environment_state` holds the vectors from the ball to all exits.
 
     Attributes:
-        description: instruction for policies that read one.
         maze: rows of the map, north first, one character per cell: `WALL`, `START`, `EXIT` or free.
         choices: for every choice the waypoints of each option, meters, the map's center being the origin.
-        episode_length: steps after which an episode is truncated.
         speed: of the expert, m/s.
     """
 
     description: str
     maze: tuple[str, ...]
     choices: tuple[tuple[Points, ...], ...]
-    episode_length: int
     speed: float
+    fps: int = FPS
+    agent_pos_dim: int = 4
+    action_dim: int = 2
 
     def _centers(self, cell: str) -> Array:
         """Centers (N, 2) of the cells of a kind, in reading order; PointMaze has the same coordinates."""
@@ -63,11 +63,6 @@ class WaysTask:
     def n_ways(self) -> int:
         """Number of ways."""
         return math.prod(len(options) for options in self.choices)
-
-    @property
-    def environment_state_dim(self) -> int:
-        """Length of the vectors from the point to all exits."""
-        return 2 * len(self.exits)
 
     def options_of(self, way: int) -> tuple[int, ...]:
         """Option of every choice that a way takes; the first choice counts most."""
@@ -120,6 +115,7 @@ TASKS: dict[str, WaysTask] = {
             "#######",
         ),
         choices=((((-2.0, -0.5), (-2.0, 0.5)), ((2.0, -0.5), (2.0, 0.5))),),
+        environment_state_dim=2,
         episode_length=100,
         speed=1.3,
     ),
@@ -142,6 +138,7 @@ TASKS: dict[str, WaysTask] = {
             "#g###g#",
         ),
         choices=((((0.0, 1.1), (0.0, 6.5)), ((-2.0, -2.1), (-2.0, -6.5)), ((2.0, -2.1), (2.0, -6.5))),),
+        environment_state_dim=6,
         episode_length=60,
         speed=2.5,
     ),
@@ -155,19 +152,9 @@ TASKS: dict[str, WaysTask] = {
             "#############",
         ),
         choices=(_round_by(-3.0), _round_by(0.0), _round_by(3.0)),
+        environment_state_dim=2,
         episode_length=130,
         speed=2.0,
     ),
 }
 """`--env.task` to task."""
-
-
-def get_task(name: str | None) -> WaysTask:
-    """Look a task up.
-
-    Raises:
-        ValueError: if it is not known.
-    """
-    if name not in TASKS:
-        raise ValueError(f"--env.task={name} is unknown. Tasks: {', '.join(TASKS)}.")
-    return TASKS[name]

@@ -11,12 +11,7 @@ import importlib
 import gymnasium as gym
 from gymnasium.envs.registration import WrapperSpec
 
-TASKS = {
-    "gym_pusht/PushT-v0": "Push the T-shaped block onto the T-shaped target.",
-    "gym_aloha/AlohaInsertion-v0": "Insert the peg into the socket.",
-    "gym_aloha/AlohaTransferCube-v0": "Pick up the cube with the right arm and hand it to the left arm.",
-}
-"""Environments without a task description of their own."""
+from lerobot_agpd.envs.base import DESCRIPTIONS
 
 
 class TaskDescription(gym.Wrapper):
@@ -29,17 +24,15 @@ class TaskDescription(gym.Wrapper):
 
 
 def register_task_descriptions() -> None:
-    """Have gymnasium wrap the environments of TASKS whose packages are installed."""
-    for env_id, description in TASKS.items():
+    """Have gymnasium wrap the environments of DESCRIPTIONS whose packages are installed."""
+    for env_id, description in DESCRIPTIONS.items():
         try:
             importlib.import_module(env_id.split("/")[0])
         except ModuleNotFoundError:
             continue
-        spec = gym.spec(env_id)
         entry_point = f"{__name__}:{TaskDescription.__name__}"
-        if all(wrapper.entry_point != entry_point for wrapper in spec.additional_wrappers):
-            wrapper = WrapperSpec(TaskDescription.__name__, entry_point, {"description": description})
-            spec.additional_wrappers += (wrapper,)
+        wrapper = WrapperSpec(TaskDescription.__name__, entry_point, {"description": description})
+        gym.spec(env_id).additional_wrappers += (wrapper,)
 
 
 register_task_descriptions()

@@ -168,12 +168,19 @@ class Teacher(ABC):
             KeyError: if the history lacks a feature or the instruction.
             ValueError: if the history is too short.
             FlagError: if the teacher cannot be guided this way.
+            FloatingPointError: if it predicts a chunk, unguided, that is not finite.
         """
         if guide is not None:
             self.require_guidance(guide.at)
         with _eval_mode(self.policy):
             chunk = self._sample_chunk(self._prepare(history), guide, generator)  # (B, H, A)
-        return self.unnormalize(chunk[:, self.start : self.start + self.n_chunk_steps])
+        actions = self.unnormalize(chunk[:, self.start : self.start + self.n_chunk_steps])
+        if guide is None and not bool(torch.isfinite(actions).all()):  # guided: the student may be the cause
+            raise FloatingPointError(
+                f"the {self.type} teacher (--policy.teacher.path) predicts actions that are not finite; are the "
+                "observations in the units that it was trained with?"
+            )
+        return actions
 
     @abstractmethod
     def _sample_chunk(

@@ -1,7 +1,8 @@
 """The hooks of LeRobot's training loop for every student of AGPD."""
 
 import logging
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,16 @@ from lerobot_agpd.replay.export import merge
 from lerobot_agpd.replay.normalization import Statistics
 from lerobot_agpd.run import RunInfo
 from lerobot_agpd.student import Student
-from lerobot_agpd.weights import require_weights
+from lerobot_agpd.weights import not_finite_weight, require_weights
 
 logger = logging.getLogger(__name__)
+
+LOSSES = ("imitation_loss", "discriminator_loss", "adversarial_loss", "representation_loss")
+
+REMEDY = (
+    "nothing of it is saved. Start again from the last checkpoint with a lower learning rate (--policy.optimizer_lr, "
+    "--policy.adversary.lr)"
+)
 
 
 class DistilledPolicy(Student):
@@ -63,6 +71,7 @@ class DistilledPolicy(Student):
             n_steps = config.collect.n_action_steps or config.n_execute
             self.representation = StateRepresentation(vector_dim(config), action_dim, n_steps)
         self._gradient_norms = GradientNorms(self.parameter_groups())
+        self._last_norms: dict[str, float] = {}
         run = run or RunInfo.of(config)
         self._training_data = (dataset_meta, dataset_stats, run or RunInfo())
         self._agpd: AGPD | None = None
@@ -96,15 +105,54 @@ class DistilledPolicy(Student):
         reference = agpd.adversary_batch(batch)
         prior = self.prior_chunk(reference.batch) if reference and len(reference.chunk) else None
         losses = agpd.losses(batch, reference, prior, self.discriminator)
-        norms = self._gradient_norms.pop()
-        return loss + losses.total, {"imitation_loss": loss.item(), **(log or {}), **losses.log, **norms}
+        log = {"imitation_loss": loss.item(), **(log or {}), **losses.log}
+        self._require_finite_losses(log, batch)
+        self._last_norms = self._gradient_norms.pop() or self._last_norms
+        return loss + losses.total, {**log, **self._last_norms}
+
+    def _require_finite_losses(self, log: Mapping[str, float], batch: Mapping[str, Any]) -> None:
+        """Stop training that has become NaN.
+
+        Raises:
+            FloatingPointError: naming the losses that are not finite and what else is known.
+        """
+        bad = [name for name, value in log.items() if name in LOSSES and not math.isfinite(value)]
+        if not bad:
+            return
+        frames = {key: value for key, value in batch.items() if isinstance(value, Tensor)}
+        causes = [key for key, value in frames.items() if not bool(torch.isfinite(value).all())]
+        weight = not_finite_weight(self)
+        causes += [f"weight {weight}"] if weight else []
+        raise FloatingPointError(
+            f"training step {self.agpd.progress.step + 1}: not finite: {', '.join([*bad, *causes])}; {REMEDY}"
+        )
 
     def update(self) -> None:
         """Advance the alternation; LeRobot calls this after every optimizer step, on every process."""
         if hasattr(super(), "update"):
             super().update()  # type: ignore[misc]
-        if self._agpd is not None and self._agpd.after_update():
+        if self._agpd is None:
+            return
+        self._require_finite_weights(self._agpd.progress.step + 1)
+        if self._agpd.after_update():
             self._merge_episodes()
+
+    def _require_finite_weights(self, step: int) -> None:
+        """Stop before LeRobot saves weights that an update has made NaN.
+
+        Gradients alone may be infinite: a gradient scaler (float16) then leaves the weights as they are.
+
+        Raises:
+            FloatingPointError: naming the weight.
+        """
+        self._last_norms = self._gradient_norms.pop() or self._last_norms
+        if all(map(math.isfinite, self._last_norms.values())):
+            return
+        weight = not_finite_weight(self)
+        if weight is not None:
+            raise FloatingPointError(
+                f"training step {step} has made the weight {weight} not finite; {REMEDY}"
+            )
 
     def _merge_episodes(self) -> None:
         """Merge all kept episodes into one dataset and upload it if requested.

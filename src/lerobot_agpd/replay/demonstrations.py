@@ -13,12 +13,13 @@ from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_agpd.replay.frames import FrameTable
+from lerobot_agpd.replay.gate import require_finite_frames, require_statistics
 from lerobot_agpd.replay.normalization import (
     Normalizer,
     Statistics,
-    floor_statistics,
     matching_normalizer,
     saved_statistics,
+    training_statistics,
 )
 
 Batch = dict[str, Any]
@@ -52,6 +53,7 @@ class DemonstrationFrames:
 
     Raises:
         ValueError: if the policy was built without a dataset.
+        FlagError: if the dataset holds values or statistics that are not finite, or no statistics.
     """
 
     def __init__(
@@ -76,7 +78,14 @@ class DemonstrationFrames:
         self.table = FrameTable.from_dataset(self.dataset, self.keys)
         self.device = torch.device("cpu")
         self._stats = dataset_stats if dataset_stats is not None else dataset_meta.stats
+        require_finite_frames(self.table, dataset_meta.repo_id)
+        require_statistics(self._stats, config, self.keys, dataset_meta.repo_id)
         self._normalizer: Normalizer | None = None
+
+    @property
+    def knows_normalizer(self) -> bool:
+        """Whether a batch was seen."""
+        return self._normalizer is not None
 
     @property
     def normalizer(self) -> Normalizer:
@@ -139,5 +148,6 @@ class DemonstrationFrames:
             if saved:
                 candidates.append(("checkpoint's", saved))
         if self._stats:
-            candidates += [("dataset's floored", floor_statistics(self._stats)), ("dataset's", self._stats)]
+            floored = training_statistics(self.config, self._stats)
+            candidates += [("dataset's floored", floored), ("dataset's", self._stats)]
         return [*candidates, ("absent", {})]  # a loop without normalization

@@ -14,6 +14,9 @@ Array = NDArray[Any]
 
 NAN = float("nan")
 
+MAY_BE_NAN = ("max_reward", "discrepancy", "guidance_shift")
+"""Numbers of a record that may be unknown."""
+
 
 @dataclass(frozen=True)
 class EpisodeSpec:
@@ -107,6 +110,8 @@ class EpisodeRecord:
         student_steps: steps that the student executed before the teacher took over.
         student_alone: whether the episode ended before the teacher took over.
         retry: whether an earlier round's episode from this start failed.
+        invalid: where the episode holds a number that is not finite, as "'feature' at step n"; such an episode never
+            succeeds and is never kept. None: nowhere.
     """
 
     number: int
@@ -123,17 +128,18 @@ class EpisodeRecord:
     student_steps: int = 0
     student_alone: bool = False
     retry: bool = False
+    invalid: str | None = None
 
     def to_json(self) -> dict[str, object]:
-        """A JSON object; NaN becomes null."""
+        """A JSON object; NaN and infinite numbers become null."""
         entry = asdict(self)
-        for key in ("discrepancy", "guidance_shift"):
-            if math.isnan(entry[key]):
+        for key in MAY_BE_NAN:
+            if not math.isfinite(entry[key]):
                 entry[key] = None
         return entry
 
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> EpisodeRecord:
         """The inverse of `to_json`."""
-        nans = {key: NAN for key in ("discrepancy", "guidance_shift") if entry[key] is None}
+        nans = {key: NAN for key in MAY_BE_NAN if entry[key] is None}
         return cls(**{**entry, **nans})

@@ -76,7 +76,8 @@ class EpisodeJournal:
         Args:
             demonstrations: metadata of the demonstrations, whose features a merged dataset takes over.
             identity: what the run's episodes depend on, such as the teacher and the environment.
-            resume: whether the run continues a checkpoint, whose episodes are its own whatever has changed.
+            resume: whether the run continues a checkpoint, whose episodes are its own whatever has changed; changes
+                are warned of.
 
         Raises:
             ValueError: if the folder holds episodes of another run.
@@ -92,17 +93,22 @@ class EpisodeJournal:
             }
             self.root.mkdir(parents=True, exist_ok=True)
             write_json(self.root / HEADER, content, indent=2)
-        if not resume:
-            self._check_identity(json.loads(json.dumps(dict(identity), default=str)))
+        self._check_identity(json.loads(json.dumps(dict(identity), default=str)), resume)
 
-    def _check_identity(self, identity: Mapping[str, Any]) -> None:
+    def _check_identity(self, identity: Mapping[str, Any], resume: bool) -> None:
         recorded = self.header["identity"]
         differing = [
             f"{key} {recorded.get(key)!r} instead of {identity.get(key)!r}"
             for key in sorted({*recorded, *identity})
             if recorded.get(key) != identity.get(key)
         ]
-        if differing:
+        if differing and resume:
+            logger.warning(
+                "the episodes in %s were collected with other settings (%s); the next ones follow the new settings",
+                self.root,
+                "; ".join(differing),
+            )
+        elif differing:
             raise ValueError(
                 f"{self.root} holds the episodes of another run ({'; '.join(differing)}); pass another "
                 "--policy.replay.root, or continue that run with --resume=true"
@@ -112,7 +118,7 @@ class EpisodeJournal:
 
     def append(self, round_number: int, rank: int, episode: Episode, record: EpisodeRecord) -> None:
         """Write an episode of a round: its frames if it is kept, then its record."""
-        folder = self._folder(round_number)
+        folder = self.folder(round_number)
         folder.mkdir(parents=True, exist_ok=True)
         vectors, images = split_columns(episode.columns)
         if record.kept:
@@ -125,7 +131,7 @@ class EpisodeJournal:
 
     def finish(self, round_number: int, report: Mapping[str, Any]) -> None:
         """Make a round a finished one; called by one process after all have written their episodes."""
-        folder = self._folder(round_number)
+        folder = self.folder(round_number)
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / REPORT, report, indent=2)
 
@@ -146,7 +152,7 @@ class EpisodeJournal:
         Raises:
             ValueError: if an index is damaged.
         """
-        folder = self._folder(round_number)
+        folder = self.folder(round_number)
         return [
             StoredEpisode(
                 record=_record(entry),
@@ -170,15 +176,15 @@ class EpisodeJournal:
         Raises:
             ValueError: if a round before the last finished one is not finished, or a report is damaged.
         """
-        finished = [number for number in self._rounds() if (self._folder(number) / REPORT).exists()]
+        finished = [number for number in self._rounds() if (self.folder(number) / REPORT).exists()]
         missing = set(range(len(finished))) - set(finished)
         if missing:
             raise ValueError(
-                f"{self._folder(min(missing))} should hold a finished round with a {REPORT}, since a later round is "
+                f"{self.folder(min(missing))} should hold a finished round with a {REPORT}, since a later round is "
                 "finished; restore it, or start a new run with another --policy.replay.root"
             )
         remedy = "restore it, or delete it to have the round finished again if no later round exists"
-        return [read_json(self._folder(number) / REPORT, remedy) for number in finished]
+        return [read_json(self.folder(number) / REPORT, remedy) for number in finished]
 
     def _rounds(self) -> list[int]:
         """Numbers of the rounds that were begun, in order."""
@@ -187,12 +193,13 @@ class EpisodeJournal:
         names = (re.fullmatch(r"round-(\d{5,})", path.name) for path in self.root.iterdir())
         return sorted(int(name[1]) for name in names if name)
 
-    def _folder(self, round_number: int) -> Path:
+    def folder(self, round_number: int) -> Path:
+        """Folder of a round, whether it exists or not."""
         return self.root / f"round-{round_number:05d}"
 
     def _entries(self, round_number: int) -> list[tuple[int, dict[str, Any]]]:
         """Lines of a round's indices with their ranks, ordered by rank and number."""
-        folder = self._folder(round_number)
+        folder = self.folder(round_number)
         if not folder.exists():
             return []
         names = (re.fullmatch(r"rank-(\d+)\.jsonl", path.name) for path in folder.iterdir())

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from lerobot_agpd.replay.demonstrations import Batch, DemonstrationFrames
 from lerobot_agpd.replay.frames import ChunkStarts
+from lerobot_agpd.replay.gate import FarValues
 from lerobot_agpd.replay.images import RecordedFrames
 from lerobot_agpd.replay.stored import StoredEpisode
 
@@ -86,6 +87,7 @@ class Replay:
         self.frames = RecordedFrames(demonstrations.dataset, self.table)
         self.config = config
         self.image_transforms = image_transforms
+        self._far_values = FarValues()
         self.n_demonstrations = len(self.table.lengths)
         self.n_demonstration_frames = len(self.table)
         self.seen_episodes: set[int] = set()
@@ -116,6 +118,11 @@ class Replay:
             self.table.append({key: _column(episode, key) for key in keys}, [len(episode)])
             self.frames.append(episode)
             self._collected_starts.append(first, len(episode))
+        if self.demonstrations.knows_normalizer:
+            for key in self.demonstrations.keys:
+                values = self.table.columns[key][n_frames:]
+                normalized = self.demonstrations.normalizer.normalize(key, values)
+                self._far_values.check("the new episodes", key, normalized)
         if len(self.table) > n_frames and len(self._collected_starts) == n_starts:
             logger.warning(
                 "none of the new episodes is longer than --policy.drop_n_last_frames=%d: none is trained on",

@@ -12,6 +12,7 @@ from torch import Tensor
 from lerobot_agpd.config import StudentConfig
 from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.replay.demonstrations import Batch
+from lerobot_agpd.replay.gate import FarValues
 from lerobot_agpd.replay.growing import GrowingTensor
 from lerobot_agpd.replay.replay import FRAME_INDEX, Replay
 
@@ -39,6 +40,7 @@ class TeacherChunks:
         self.seconds = 0.0
         self._chunks: GrowingTensor | None = None  # (N, S, A) in the student's normalized space
         self._sampled: set[int] = set()  # episodes
+        self._far_values = FarValues()
 
     def at(self, frame_index: Tensor) -> tuple[Tensor, int]:
         """Chunks (B, S, A) in the student's normalized space, zero beyond the shared steps, and their number.
@@ -83,7 +85,9 @@ class TeacherChunks:
             generator = torch.Generator(device=chunks.device).manual_seed(self.seed + start)
             for part in torch.arange(start, ends[episode]).split(BATCH_SIZE):
                 chunks[part] = 0.0
-                chunks[part, : self.n_shared] = self._teacher_chunks(part, generator)
+                sampled = self._teacher_chunks(part, generator)
+                self._far_values.check("the teacher's chunks", ACTION, sampled)
+                chunks[part, : self.n_shared] = sampled
             n_frames += ends[episode] - start
         self._sampled.update(episodes)
         seconds = time.perf_counter() - began

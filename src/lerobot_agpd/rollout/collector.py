@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing
 
@@ -31,6 +32,8 @@ from lerobot_agpd.rollout.seeds import (
 )
 from lerobot_agpd.rollout.strategies import Strategy
 from lerobot_agpd.stopwatch import Stopwatch
+
+logger = logging.getLogger(__name__)
 
 
 class Collector:
@@ -141,6 +144,27 @@ class Collector:
                 yield from rollouts.run(specs[position :: len(environments)])
         finally:
             close_envs(tasks)
+
+    def require_valid_episodes(self, round_number: int) -> None:
+        """Warn of a round's invalid episodes, of all processes, which have been dropped.
+
+        Raises:
+            FloatingPointError: if most of the round's episodes are invalid.
+        """
+        records = self.journal.records(round_number)
+        invalid = [record for record in records if record.invalid]
+        if not invalid:
+            return
+        facts = (
+            f"round {round_number}: {len(invalid)} of {len(records)} episodes are dropped because they hold numbers that "
+            f"are not finite (first: {invalid[0].invalid}, environment seed {invalid[0].seed}), which come from the "
+            f"environment '{self.env_config.type}' (--env.*)"
+        )
+        if 2 * len(invalid) > len(records):
+            raise FloatingPointError(
+                f"{facts}. Repair it, delete {self.journal.folder(round_number)} and go on with --resume=true"
+            )
+        logger.warning(facts)
 
     @torch.no_grad()
     def diagnose(self, round_number: int, strength: float, strategy: Strategy) -> RoundDiagnostics | None:

@@ -19,30 +19,33 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Tally:
-    """Counts of episodes; successes are those of episodes that were not solved at the start."""
+    """Counts of episodes; successes are those of valid episodes that were not solved at the start."""
 
     generated: int
     solved_at_start: int
     successful: int
     kept: int
+    invalid: int = 0
 
     @classmethod
     def of(cls, records: Iterable[EpisodeRecord]) -> Tally:
         """Count records."""
         records = list(records)
-        counted = [record for record in records if not record.solved_at_start]
+        valid = [record for record in records if not record.invalid]
+        counted = [record for record in valid if not record.solved_at_start]
         return cls(
             generated=len(records),
-            solved_at_start=len(records) - len(counted),
+            solved_at_start=len(valid) - len(counted),
             successful=sum(record.success for record in counted),
             kept=sum(record.kept for record in records),
+            invalid=len(records) - len(valid),
         )
 
 
 def success_rate(tallies: Iterable[Tally]) -> float | None:
-    """Success rate over the episodes of several tallies that were not solved at the start; None without any."""
+    """Success rate over the valid episodes of several tallies that were not solved at the start; None without any."""
     tallies = list(tallies)
-    counted = sum(tally.generated - tally.solved_at_start for tally in tallies)
+    counted = sum(tally.generated - tally.solved_at_start - tally.invalid for tally in tallies)
     return sum(tally.successful for tally in tallies) / counted if counted else None
 
 
@@ -162,10 +165,11 @@ def log_round(report: RoundReport) -> None:
     rates = [success_rate([tally]) for tally in tallies]
     shown = ["-" if rate is None else f"{rate:.2f}" for rate in rates]
     logger.info(
-        "round %d: %d episodes, %d successful, %d kept; success of the strategy %s, of the teacher alone %s, of failed "
+        "round %d: %d episodes, %d invalid, %d successful, %d kept; success of the strategy %s, of the teacher alone %s, of failed "
         "starts %s; guidance scale -> %.3g; %.0f s",
         report.round,
         report.total.generated,
+        report.total.invalid,
         report.total.successful,
         report.total.kept,
         *shown,

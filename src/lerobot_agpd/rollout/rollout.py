@@ -129,7 +129,9 @@ class Rollouts:
         if not undecided:
             return
         history: dict[str, Any] = {
-            key: torch.stack([torch.stack([step[key] for step in entry.history]) for entry in undecided])
+            key: _finite(
+                torch.stack([torch.stack([step[key] for step in entry.history]) for entry in undecided])
+            )
             for key in undecided[0].history[0]
         }
         history[TASK] = [self.task] * len(undecided)
@@ -197,6 +199,11 @@ def _attribute(envs: gym.vector.VectorEnv, name: str) -> Any:
 
 def _row(observations: dict[str, Tensor], row: int) -> dict[str, Tensor]:
     return {key: value[row] for key, value in observations.items()}
+
+
+def _finite(values: Tensor) -> Tensor:
+    """Vectors (B, T, D) with zeros for what is not finite: such an episode is dropped, and must not end the run before."""
+    return torch.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0) if values.ndim == 3 else values
 
 
 def _success(info: Mapping[str, Any], slot: int, done: bool) -> bool | None:

@@ -97,6 +97,8 @@ def failed_starts(records: Iterable[EpisodeRecord]) -> list[int]:
     solved = set()
     for record in records:
         attempts[record.seed] = attempts.get(record.seed, 0) + 1
-        if record.success or record.solved_at_start:
+        if (
+            record.success or record.solved_at_start or record.invalid
+        ):  # the environment's fault, not the teacher's
             solved.add(record.seed)
     return sorted((seed for seed in attempts if seed not in solved), key=lambda seed: attempts[seed])

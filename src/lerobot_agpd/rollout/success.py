@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from lerobot_agpd.config import CollectConfig
 from lerobot_agpd.replay.episode import Episode, EpisodeRecord
+from lerobot_agpd.replay.gate import first_not_finite
 
 MIN_LENGTH = 2
 """Episodes with fewer steps count as solved at the start: they teach nothing."""
@@ -14,7 +15,8 @@ def classify(episode: Episode, config: CollectConfig) -> EpisodeRecord:
 
     An episode succeeds if its largest reward reaches `min_reward`, or, without that, if the environment says
     `is_success` at its last step. One that succeeds at its first step, or that the student finished alone, is dropped.
-    With `keep_failures` failures are kept too, as in DAgger (arXiv:1011.0686), which has no filter.
+    With `keep_failures` failures are kept too, as in DAgger (arXiv:1011.0686), which has no filter. An episode that
+    holds a number that is not finite is neither a success nor kept.
 
     Raises:
         ValueError: if success is required of an environment that does not report it.
@@ -31,6 +33,9 @@ def classify(episode: Episode, config: CollectConfig) -> EpisodeRecord:
         success = bool(episode.successes[-1])
         at_start = bool(episode.successes[0])
     solved_at_start = at_start or len(episode) < MIN_LENGTH
+    invalid = first_not_finite(episode.columns)
+    success = success and invalid is None
+    worth_keeping = (success or config.keep_failures) and invalid is None
     return EpisodeRecord(
         number=episode.spec.number,
         seed=episode.spec.seed,
@@ -40,10 +45,11 @@ def classify(episode: Episode, config: CollectConfig) -> EpisodeRecord:
         is_success=episode.is_success,
         success=success,
         solved_at_start=solved_at_start,
-        kept=(success or config.keep_failures) and not solved_at_start and not episode.student_alone,
+        kept=worth_keeping and not solved_at_start and not episode.student_alone,
         discrepancy=episode.discrepancy,
         guidance_shift=episode.guidance_shift,
         student_steps=episode.student_steps,
         student_alone=episode.student_alone,
         retry=episode.spec.retry,
+        invalid=invalid,
     )

@@ -5,31 +5,22 @@ from __future__ import annotations
 import logging
 import shlex
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_agpd.config import require
 from lerobot_agpd.files import write_text
-from lerobot_agpd.rollout.report import read_reports
 from lerobot_agpd.studies.curves import draw_task_curves
-from lerobot_agpd.studies.jobs import Job, Step
+from lerobot_agpd.studies.jobs import Execute, Job
 from lerobot_agpd.studies.matrix import Matrix
 from lerobot_agpd.studies.outcomes import draw_outcomes
 from lerobot_agpd.studies.provenance import digest
 from lerobot_agpd.studies.report import comparison_report
-from lerobot_agpd.studies.results import Methods, RunResult
-from lerobot_agpd.studies.run_results import evaluate_run, read_result, read_results
+from lerobot_agpd.studies.results import Methods
+from lerobot_agpd.studies.run_results import read_result, read_results
 from lerobot_agpd.studies.runs import Run
-from lerobot_agpd.studies.training import (
-    TRAIN_LOG,
-    StartLog,
-    is_trained,
-    prepare,
-    progress,
-    replay_folder,
-    train_command,
-)
+from lerobot_agpd.studies.training import TRAIN_LOG, is_trained, noted_start, prepare, train_command
 
 logger = logging.getLogger(__name__)
 
@@ -48,21 +39,15 @@ class Comparison:
     Attributes:
         path: YAML of the matrix.
         matrix: its content.
-        train: whether runs are trained.
-        evaluate: whether they are evaluated.
         threads: OMP_NUM_THREADS of every command.
     """
 
     path: Path
     matrix: Matrix
-    train: bool = True
-    evaluate: bool = True
     threads: int = 1
 
     def needs_work(self, run: Run) -> bool:
         """Whether a run still has to be trained or evaluated."""
-        if not self.evaluate:
-            return not run.policy and not is_trained(run)
         try:
             result = read_result(run, self.matrix)
         except ValueError as error:
@@ -75,59 +60,30 @@ class Comparison:
 
     def job(self, run: Run) -> Job:
         """Train (or resume) a run, then evaluate it."""
-        steps = []
-        if self.train and not run.policy:
-            steps.append(training_step(run, self.threads))
-        if self.evaluate:
-            command = executable(self.evaluate_command(run))
-            steps.append(Step(lambda: command, run.folder / EVALUATE_LOG))
-        return Job(run.name, run.folder, steps)
 
-    def evaluate_command(self, run: Run) -> list[str]:
-        """The command that evaluates one run."""
+        def work(execute: Execute) -> None:
+            if not run.policy and not is_trained(run):
+                prepare(run)
+                command = train_command(run)
+                with noted_start(run, command, self.threads):
+                    execute(executable(command), run.folder / TRAIN_LOG)
+            execute(executable(self._evaluate_command(run)), run.folder / EVALUATE_LOG)
+
+        return Job(run.name, run.folder, work)
+
+    def describe(self, run: Run) -> str:
+        """The commands that a run still needs."""
+        if not self.needs_work(run):
+            return f"# {run.name}: finished"
+        commands = [] if run.policy or is_trained(run) else [train_command(run)]
+        return "\n".join([f"# {run.name}", *map(shlex.join, [*commands, self._evaluate_command(run)])])
+
+    def _evaluate_command(self, run: Run) -> list[str]:
         args = [f"--matrix={self.path}", f"--output={self.matrix.output}", "--only=evaluate"]
         args += [f"--tasks=[{run.task}]", f"--methods=[{run.method}]"]
         if run.seed is not None:
             args.append(f"--seeds=[{run.seed}]")
         return ["lerobot-agpd-compare", *args]
-
-    def evaluate_here(self, run: Run) -> None:
-        """Evaluate one run in this process."""
-        evaluate_run(self.matrix, run, read_reports(replay_folder(run)))
-
-    def describe(self, run: Run) -> str:
-        """The state of a run and its commands."""
-        return "\n".join([f"# {run.name}: {self._state(run)}", *map(shlex.join, self._commands(run))])
-
-    def _state(self, run: Run) -> str:
-        reached = progress(run)
-        if not self.needs_work(run):
-            return "finished"
-        if run.policy:
-            return "evaluated only"
-        return f"at step {reached.step} of {reached.steps}" if reached else "not begun"
-
-    def _commands(self, run: Run) -> Iterator[list[str]]:
-        if self.train and not run.policy and not is_trained(run):
-            yield train_command(run)
-        if self.evaluate:
-            yield self.evaluate_command(run)
-
-
-def training_step(run: Run, threads: int) -> Step:
-    """The lerobot-train command of a run, noted in its log of starts."""
-    starts: list[StartLog] = []
-
-    def command() -> Sequence[str] | None:
-        if is_trained(run):
-            return None
-        prepare(run)
-        args = train_command(run)
-        starts.append(StartLog(run))
-        starts[0].begin(args, threads)
-        return executable(args)
-
-    return Step(command, run.folder / TRAIN_LOG, lambda returncode: starts[0].end(returncode))
 
 
 def executable(command: Sequence[str]) -> list[str]:
@@ -141,21 +97,12 @@ def write_report(matrix: Matrix) -> str:
     Raises:
         ValueError: if there is no result.
     """
-    results, missing = read_results(matrix, read_or_skip)
+    results, missing = read_results(matrix)
     require(bool(results), f"{matrix.output} holds no result of this comparison yet")
     text = comparison_report(matrix, results, missing)
     write_text(matrix.output / REPORT, text)
     write_pictures(matrix, results, matrix.output)
     return text
-
-
-def read_or_skip(run: Run, matrix: Matrix) -> RunResult | None:
-    """Read a result; a damaged or outdated one counts as missing."""
-    try:
-        return read_result(run, matrix)
-    except ValueError as error:
-        logger.warning("left out of the report: %s", error)
-        return None
 
 
 def write_pictures(matrix: Matrix, results: Mapping[str, Methods], folder: Path) -> None:

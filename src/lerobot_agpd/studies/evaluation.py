@@ -7,6 +7,7 @@ import json
 import logging
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,9 @@ from lerobot.scripts.lerobot_eval import eval_policy
 from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import seeded_context
 
+from lerobot_agpd.config import require
 from lerobot_agpd.files import read_json, write_json
-from lerobot_agpd.loading import load_policy
+from lerobot_agpd.loading import load_policy, read_policy_config
 from lerobot_agpd.studies.latency import Latency, chunk_latency
 from lerobot_agpd.studies.provenance import digest
 from lerobot_agpd.studies.statistics import success_rate
@@ -50,60 +52,79 @@ class Evaluation:
         return float(np.mean(self.values(measure)))
 
 
-class Environments:
-    """Vector environments, built when first used and kept: building some takes seconds. Leaving the context closes them."""
+@dataclass
+class Evaluator:
+    """Evaluations of checkpoints in one environment, stored in a folder and reused for the same request.
 
-    def __init__(self, config: EnvConfig, n_envs: int):
-        self.config = config
-        self.n_envs = n_envs
-        self._suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}
+    Environments are built when first used and kept, since that takes seconds.
 
-    @property
-    def vectors(self) -> list[gym.vector.VectorEnv]:
-        """One vector environment per task."""
-        if not self._suites:
-            self._suites = make_env(self.config, n_envs=self.n_envs, use_async_envs=False)
-        return [envs for suite in self._suites.values() for envs in suite.values()]
-
-    def __enter__(self) -> Environments:
-        """Build nothing yet."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close the environments."""
-        close_envs(self._suites)
-        self._suites = {}
-
-
-class Checkpoint:
-    """A policy with its processors, ready to act.
-
-    Args:
-        path: folder or Hub repository.
-        device: where it runs.
-        n_action_steps: steps executed per prediction; None: the checkpoint's.
-
-    Raises:
-        ValueError: if it cannot execute that many.
+    Attributes:
+        env_config: where policies act.
+        n_envs: environments side by side.
+        folder: gets a folder `evaluations`, one file per request, named by the request's hash.
+        device: where policies run.
     """
 
-    def __init__(self, path: Path | str, device: str, n_action_steps: int | None = None):
-        self.config = checkpoint_config(path, n_action_steps)
-        self.config.device = device
-        self.loaded = load_policy(self.config)
+    env_config: EnvConfig
+    n_envs: int
+    folder: Path
+    device: str
 
-    def evaluate(self, environments: Environments, n_episodes: int, start_seed: int) -> Evaluation:
+    def close(self) -> None:
+        """Close the environments."""
+        if "environments" in self.__dict__:
+            close_envs(self.environments)
+
+    @cached_property
+    def environments(self) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """LeRobot's vector environments, by suite and task."""
+        return make_env(self.env_config, n_envs=self.n_envs, use_async_envs=False)
+
+    def evaluate(
+        self, path: Path | str, episodes: int, seed: int, n_action_steps: int | None = None
+    ) -> Evaluation:
+        """Evaluate a checkpoint on `episodes` environments from `seed` on, unless that is known already.
+
+        Raises:
+            FlagError: if it cannot execute `n_action_steps` steps per prediction; None: the checkpoint's.
+        """
+        request = {
+            "weights": digest(path),
+            "env": draccus.encode(self.env_config, EnvConfig),
+            "episodes": episodes,
+            "seed": seed,
+            "n_action_steps": n_action_steps,
+            "batch_size": self.n_envs,
+            "device": self.device,
+        }
+        name = hashlib.sha256(json.dumps(request, sort_keys=True, default=str).encode()).hexdigest()[:16]
+        file = self.folder / EVALUATIONS / f"{name}.json"
+        if file.is_file():
+            stored = read_json(file)
+            return Evaluation(**{key: stored[key] for key in stored if key != "request"})
+        evaluation = self._roll_out(checkpoint_config(path, self.device, n_action_steps), episodes, seed)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_json(file, {"request": request, **asdict(evaluation)})
+        logger.info("evaluated %s: success %s", path, success_rate(evaluation.successes))
+        return evaluation
+
+    def latency(self, path: Path | str) -> Latency:
+        """Time one chunk of a checkpoint at batch size 1."""
+        return chunk_latency(load_policy(checkpoint_config(path, self.device)).policy)
+
+    def _roll_out(self, config: PreTrainedConfig, n_episodes: int, start_seed: int) -> Evaluation:
         """Roll out episodes from consecutive seeds as `lerobot-eval` does; policies that sample are seeded, too."""
-        processors = make_env_pre_post_processors(environments.config, self.config)
+        loaded = load_policy(config)
+        processors = make_env_pre_post_processors(self.env_config, config)
         episodes: list[dict[str, Any]] = []
-        for envs in environments.vectors:
+        for envs in (envs for suite in self.environments.values() for envs in suite.values()):
             with torch.no_grad(), seeded_context(start_seed):
                 info = eval_policy(
                     envs,
-                    self.loaded.policy,
+                    loaded.policy,
                     *processors,
-                    self.loaded.preprocessor,
-                    self.loaded.postprocessor,
+                    loaded.preprocessor,
+                    loaded.postprocessor,
                     n_episodes=n_episodes,
                     start_seed=start_seed,
                 )
@@ -114,96 +135,22 @@ class Checkpoint:
             seeds=[int(episode["seed"]) for episode in episodes],
         )
 
-    def latency(self) -> Latency:
-        """Time one chunk at batch size 1."""
-        return chunk_latency(self.loaded.policy)
 
-
-class Evaluator:
-    """Evaluations of checkpoints in one environment, stored in a folder and reused for the same request.
-
-    Args:
-        environments: where they act.
-        folder: gets a folder `evaluations`, one file per request, named by the request's hash.
-        device: where policies run.
-    """
-
-    def __init__(self, environments: Environments, folder: Path, device: str):
-        self.environments = environments
-        self.folder = folder / EVALUATIONS
-        self.device = device
-
-    def evaluate(
-        self, path: Path | str, episodes: int, seed: int, n_action_steps: int | None = None
-    ) -> Evaluation:
-        """Evaluate a checkpoint on `episodes` environments from `seed` on, unless that is known already."""
-        request = {
-            "weights": digest(path),
-            "env": draccus.encode(self.environments.config, EnvConfig),
-            "episodes": episodes,
-            "seed": seed,
-            "n_action_steps": n_action_steps,
-            "batch_size": self.environments.n_envs,
-            "device": self.device,
-        }
-        stored = read_evaluation(self.folder, request)
-        if stored is not None:
-            return stored
-        checkpoint = Checkpoint(path, self.device, n_action_steps)
-        evaluation = checkpoint.evaluate(self.environments, episodes, seed)
-        store_evaluation(self.folder, request, evaluation)
-        logger.info("evaluated %s: success %s", path, success_rate(evaluation.successes))
-        return evaluation
-
-    def latency(self, path: Path | str, n_action_steps: int | None = None) -> Latency:
-        """Time one chunk of a checkpoint."""
-        return Checkpoint(path, self.device, n_action_steps).latency()
-
-
-def store_evaluation(folder: Path, request: Mapping[str, Any], evaluation: Evaluation) -> Path:
-    """Write an evaluation with the request that it answers; returns the file."""
-    folder.mkdir(parents=True, exist_ok=True)
-    file = _file(folder, request)
-    write_json(file, {"request": request, **asdict(evaluation)})
-    return file
-
-
-def read_evaluation(folder: Path, request: Mapping[str, Any]) -> Evaluation | None:
-    """Read a stored evaluation; None if it is missing, damaged, or not whole."""
-    file = _file(folder, request)
-    if not file.is_file():
-        return None
-    try:
-        content = read_json(file)
-        evaluation = Evaluation(**{key: content[key] for key in ("successes", "max_rewards", "seeds")})
-    except (ValueError, KeyError) as error:
-        logger.warning("evaluating again: %s", error)
-        return None
-    seeds = list(range(request["seed"], request["seed"] + request["episodes"]))
-    lengths = {len(evaluation.successes), len(evaluation.max_rewards)}
-    return evaluation if evaluation.seeds == seeds and lengths == {len(seeds)} else None
-
-
-def _file(folder: Path, request: Mapping[str, Any]) -> Path:
-    text = json.dumps(request, sort_keys=True, default=str)
-    return folder / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.json"
-
-
-def checkpoint_config(path: Path | str, n_action_steps: int | None = None) -> Any:
+def checkpoint_config(path: Path | str, device: str, n_action_steps: int | None = None) -> PreTrainedConfig:
     """Read the configuration of a checkpoint that is to execute a number of steps per prediction; None: its own.
 
     Raises:
-        ValueError: if it cannot execute that many.
+        FlagError: if it cannot execute that many.
     """
-    config: Any = PreTrainedConfig.from_pretrained(path)
+    config: Any = read_policy_config(path, "checkpoint")
+    config.device = device
     if n_action_steps is not None:
-        if not 1 <= n_action_steps <= config.n_action_steps:
-            raise ValueError(
-                f"n_action_steps={n_action_steps}: {path} was trained to execute {config.n_action_steps} steps per "
-                "prediction; it can execute fewer, at least 1, not more"
-            )
+        require(
+            1 <= n_action_steps <= config.n_action_steps,
+            f"n_action_steps={n_action_steps}: {path} was trained to execute {config.n_action_steps} steps per "
+            "prediction; it can execute fewer, at least 1, not more",
+        )
         config.n_action_steps = n_action_steps
-    config.pretrained_path = Path(path)
     return config
 
 

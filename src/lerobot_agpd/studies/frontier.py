@@ -30,7 +30,7 @@ def plot_frontier(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Diversity, coverage and success against the distance of executed actions from the teacher's.
 
     Args:
-        rows: `SweepRow.to_json()` of every setting.
+        rows: the `SweepRow` of every setting, as JSON.
         path: of the picture.
     """
     figure = Figure(figsize=(13, 4), layout="constrained", dpi=120)

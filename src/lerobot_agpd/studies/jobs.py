@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import asyncio
 import fcntl
 import logging
 import os
-import re
 import signal
-from collections.abc import Callable, Iterator, Sequence
+import subprocess
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,35 +27,65 @@ from rich.progress import (
 logger = logging.getLogger(__name__)
 
 LOCK = "lock"
-BAR = re.compile(rb"([A-Z][\w ]*?): +\d+%\|[^|]*\| (\d+/\d+)")
-LOG_TAIL = 4000
 LAST_LINES = 15
 GRACE = 10.0
-POLL = 1.0
 
-
-@dataclass(frozen=True)
-class Step:
-    """One command of a job.
-
-    Attributes:
-        command: returns the arguments when the step's turn comes; None if nothing is left to do.
-        log: file that takes what it prints.
-        done: called with the return code.
-    """
-
-    command: Callable[[], Sequence[str] | None]
-    log: Path
-    done: Callable[[int], None] = lambda returncode: None
+Execute = Callable[[Sequence[str], Path], None]
+"""Runs a command whose output goes to the end of a log; raises RuntimeError with the log's end if it fails."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """A run's steps, in order; a failed one ends the job."""
+    """Work on a folder.
+
+    Attributes:
+        name: as shown.
+        folder: locked meanwhile.
+        work: called with what runs a command; an exception ends the job.
+    """
 
     name: str
     folder: Path
-    steps: Sequence[Step]
+    work: Callable[[Execute], None]
+
+
+class Processes:
+    """The processes that jobs have started and that still run."""
+
+    def __init__(self, threads: int):
+        self.env = {**os.environ, "OMP_NUM_THREADS": str(threads)}
+        self.running: set[subprocess.Popen[bytes]] = set()
+
+    def run(self, job: Job, bars: Progress) -> None:
+        """Do a job's work in its locked folder."""
+        with _locked(job.folder) as lock:
+            bar = bars.add_task(job.name, total=None)
+            try:
+                job.work(lambda command, log: self._execute(command, log, lock))
+            finally:
+                bars.remove_task(bar)
+
+    def _execute(self, command: Sequence[str], log: Path, lock: int) -> None:
+        """Run a command; it holds the lock too, so that the folder stays locked if this process is killed."""
+        with (
+            log.open("ab") as out,
+            subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=self.env, pass_fds=[lock]
+            ) as process,
+        ):
+            self.running.add(process)
+            returncode = process.wait()
+            self.running.discard(process)
+        if returncode:
+            raise RuntimeError(f"ended with {returncode}; the end of {log}:\n{_last_lines(log)}")
+
+    def end(self, futures: Iterable[Future[None]]) -> None:
+        """End all processes and wait for the threads that run them."""
+        deadline = time.monotonic() + GRACE
+        while not all(future.done() for future in futures):
+            for process in list(self.running):
+                process.terminate() if time.monotonic() < deadline else process.kill()
+            time.sleep(0.1)
 
 
 def run_jobs(jobs: Sequence[Job], at_once: int, threads: int, console: Console) -> dict[str, str]:
@@ -67,98 +98,29 @@ def run_jobs(jobs: Sequence[Job], at_once: int, threads: int, console: Console) 
         SystemExit: after an interrupt or SIGTERM, which ends all processes that were started.
     """
     failures: dict[str, str] = {}
+    processes = Processes(threads)
     counted = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     columns = (SpinnerColumn(), TextColumn("{task.description}"), *counted)
-    with Progress(*columns, console=console, transient=True) as bars:
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: raises KeyboardInterrupt
+    with Progress(*columns, console=console, transient=True) as bars, ThreadPoolExecutor(at_once) as pool:
+        total = bars.add_task("runs", total=len(jobs))
+        futures = {pool.submit(processes.run, job, bars): job for job in jobs}
         try:
-            asyncio.run(_run_all(jobs, at_once, threads, bars, failures))
-        except (asyncio.CancelledError, KeyboardInterrupt):
+            for future in as_completed(futures):
+                name, error = futures[future].name, future.exception()
+                bars.advance(total)
+                if error is None:
+                    logger.info("%s: finished", name)
+                else:
+                    failures[name] = str(error)
+                    logger.error("%s: %s", name, error)
+        except KeyboardInterrupt:
+            pool.shutdown(wait=False, cancel_futures=True)
+            processes.end(futures)
             raise SystemExit("interrupted; run the same command to go on") from None
+        finally:
+            signal.signal(signal.SIGTERM, before)
     return failures
-
-
-async def _run_all(
-    jobs: Sequence[Job], at_once: int, threads: int, bars: Progress, failures: dict[str, str]
-) -> None:
-    slots = asyncio.Semaphore(at_once)
-    total = bars.add_task("runs", total=len(jobs))
-    main = asyncio.current_task()
-    assert main is not None
-    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, main.cancel)
-
-    async def work(job: Job) -> None:
-        async with slots:
-            bar = bars.add_task(job.name, total=None)
-            problem = await _run_job(job, threads, lambda text: bars.update(bar, description=text))
-            bars.remove_task(bar)
-            bars.advance(total)
-            if problem:
-                failures[job.name] = problem
-                logger.error("%s: %s", job.name, problem)
-            else:
-                logger.info("%s: finished", job.name)
-
-    async with asyncio.TaskGroup() as group:
-        for job in jobs:
-            group.create_task(work(job))
-
-
-async def _run_job(job: Job, threads: int, show: Callable[[str], None]) -> str | None:
-    """Run a job in its locked folder; returns the reason if that fails."""
-    try:
-        with _locked(job.folder) as lock:
-            return await _run_steps(job, threads, lock, show)
-    except (OSError, ValueError) as error:
-        return str(error)
-
-
-async def _run_steps(job: Job, threads: int, lock: int, show: Callable[[str], None]) -> str | None:
-    """Run a job's steps; returns the reason if one fails."""
-    for step in job.steps:
-        command = step.command()
-        if command is None:
-            continue
-        with step.log.open("ab") as log:
-            process = await asyncio.create_subprocess_exec(
-                *command,
-                stdin=asyncio.subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                env={**os.environ, "OMP_NUM_THREADS": str(threads)},
-                pass_fds=[lock],
-            )
-            returncode = await _wait(process, lambda text: show(f"{job.name}  {text}"), step.log)
-        step.done(returncode)
-        if returncode:
-            return f"ended with {returncode}; the end of {step.log}:\n{_last_lines(step.log)}"
-    return None
-
-
-async def _wait(process: asyncio.subprocess.Process, show: Callable[[str], None], log: Path) -> int:
-    """Wait for a process, showing its progress; end it when canceled."""
-    try:
-        while True:
-            try:
-                return await asyncio.wait_for(asyncio.shield(process.wait()), POLL)
-            except TimeoutError:
-                show(activity(log))
-    finally:
-        if process.returncode is None:
-            process.terminate()
-            try:
-                await asyncio.wait_for(process.wait(), GRACE)
-            except TimeoutError:
-                process.kill()
-
-
-def activity(log: Path) -> str:
-    """Read a log's last progress bar, e.g. `Training 135/300`; empty without one."""
-    if not log.exists():
-        return ""
-    with log.open("rb") as file:
-        file.seek(max(0, log.stat().st_size - LOG_TAIL))
-        bars = BAR.findall(file.read())
-    return b" ".join(bars[-1]).decode() if bars else ""
 
 
 def _last_lines(log: Path) -> str:

@@ -10,8 +10,6 @@ import torch
 from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 
-WARMUP = 3
-
 
 @dataclass(frozen=True)
 class Latency:
@@ -24,7 +22,7 @@ class Latency:
 
 
 def chunk_latency(
-    policy: PreTrainedPolicy, batch_size: int = 1, repeats: int = 50, warmup: int = WARMUP
+    policy: PreTrainedPolicy, batch_size: int = 1, repeats: int = 50, warmup: int = 3
 ) -> Latency:
     """Time `predict_action_chunk` on random observations.
 

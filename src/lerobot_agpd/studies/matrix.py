@@ -123,11 +123,11 @@ class Matrix:
 
     tasks: dict[str, TaskEntry]
     methods: dict[str, MethodEntry]
-    # training seeds
+    # Training seeds.
     seeds: list[int]
-    # folder of the runs and the report
+    # Folder of the runs and the report.
     output: Path
-    # flags of lerobot-train for all runs
+    # Flags of lerobot-train for all runs.
     common: dict[str, Any] = field(default_factory=dict)
     evaluation: EvaluationEntry = field(default_factory=EvaluationEntry)
     # Methods that all are compared with; default: all.
@@ -168,7 +168,7 @@ class Matrix:
 
 
 def load_matrix(path: Path) -> Matrix:
-    """Read a comparison; `${VARIABLE}` in its texts stands for environment variables.
+    """Read a comparison; `${VARIABLE}` in the file stands for an environment variable.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -177,7 +177,13 @@ def load_matrix(path: Path) -> Matrix:
     if not path.is_file():
         raise FileNotFoundError(f"--matrix={path}: no such file")
     try:
-        content = _expand(yaml.safe_load(path.read_text()))
+        text = Template(path.read_text()).substitute(os.environ)
+    except KeyError as error:
+        raise ValueError(
+            f"--matrix={path} uses ${{{error.args[0]}}}, which is not in the environment"
+        ) from error
+    try:
+        content = yaml.safe_load(text)
         require(isinstance(content, dict), f"expected tasks, methods, seeds and output, got {content}")
         return draccus.decode(Matrix, content)
     except (ValueError, ParsingError, yaml.YAMLError) as error:
@@ -191,17 +197,3 @@ def flat(flags: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         name = f"{prefix}.{key}" if prefix else str(key)
         result |= flat(value, name) if isinstance(value, Mapping) and value else {name: value}
     return result
-
-
-def _expand(value: Any) -> Any:
-    """Fill in environment variables."""
-    if isinstance(value, str):
-        try:
-            return Template(value).substitute(os.environ)
-        except KeyError as error:
-            raise ValueError(
-                f"'{value}' uses ${{{error.args[0]}}}, which is not in the environment"
-            ) from error
-    if isinstance(value, dict):
-        return {key: _expand(entry) for key, entry in value.items()}
-    return [_expand(entry) for entry in value] if isinstance(value, list) else value

@@ -8,7 +8,7 @@ import platform
 import subprocess
 from collections.abc import Mapping
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +34,9 @@ PACKAGES = (
 @cache
 def provenance() -> dict[str, Any]:
     """Versions of the installed packages, the commit of this package's checkout (None outside of one), the host."""
+    packages = {entry.name: entry.version for entry in distributions() if entry.name in PACKAGES}
     return {
-        "versions": {"python": platform.python_version(), **_versions()},
+        "versions": {"python": platform.python_version(), **packages},
         "git": _commit(Path(lerobot_agpd.__file__)),
         "host": {
             "name": platform.node(),
@@ -75,16 +76,6 @@ def _sha256(path: Path) -> str | None:
         return None
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _versions() -> dict[str, str]:
-    versions = {}
-    for name in PACKAGES:
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return versions
 
 
 def _commit(file: Path) -> dict[str, Any] | None:

@@ -3,41 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from gymnasium.vector import VectorEnv, VectorWrapper
-from numpy.typing import NDArray
-from torch import Tensor
 
 from lerobot_agpd.agpd import GuidedStrategy
+from lerobot_agpd.replay.episode import Array, Episode
 from lerobot_agpd.rollout.rollout import Decision
-
-Array = NDArray[Any]
 
 COLORS = {"teacher": (0, 114, 178), "guided": (213, 94, 0), "student": (230, 60, 180)}
 LABELS = {"teacher": "teacher alone", "guided": "guided teacher", "student": "student"}
-
-
-@dataclass(frozen=True)
-class Chunks:
-    """The three chunks of one decision, (n, A) in the environment's units.
-
-    Attributes:
-        teacher: without guidance, from the same initial noise as `guided`.
-        guided: pulled toward the student; executed.
-        student: what it was pulled toward.
-    """
-
-    teacher: Array
-    guided: Array
-    student: Array
-
-    def items(self) -> list[tuple[str, Array]]:
-        """Names and chunks."""
-        return [(field.name, getattr(self, field.name)) for field in fields(self)]
 
 
 @dataclass(frozen=True)
@@ -46,14 +24,15 @@ class DecisionRecord:
 
     Attributes:
         step: environment step at which the chunks begin.
-        chunks: the three chunks.
+        chunks: `teacher` (without guidance, from the same initial noise), `guided` (executed) and `student` (what it
+            was pulled toward), (n, A) in the environment's units.
         teacher_discrepancy: J between the teacher's own chunk and the student's.
         guided_discrepancy: J between the executed chunk and the student's.
         guidance_shift: mean shift of the guided denoising steps, in sigmas; NaN without guidance.
     """
 
     step: int
-    chunks: Chunks
+    chunks: Mapping[str, Array]
     teacher_discrepancy: float
     guided_discrepancy: float
     guidance_shift: float
@@ -64,32 +43,20 @@ class RolloutRecord:
     """A rollout of T steps.
 
     Attributes:
-        observations: feature name to (T, D) vectors or (T, H, W, C) uint8 images.
-        actions: (T, A) as executed.
-        rewards: (T,).
-        successes: (T,) bool, or None if the environment does not say.
+        episode: observations, actions, rewards and successes.
         decisions: in the order of their steps.
         frames: T rendered frames (H, W, 3) uint8, or none.
         to_frame: maps actions (n, 2) to pixels (n, 2) of the frame; None if actions are no positions in it.
     """
 
-    observations: Mapping[str, Array]
-    actions: Array
-    rewards: Array
-    successes: Array | None
+    episode: Episode
     decisions: Sequence[DecisionRecord]
     frames: Sequence[Array] = ()
     to_frame: Callable[[Array], Array] | None = None
 
-    @property
-    def cameras(self) -> list[str]:
-        """Observations that are images."""
-        return [key for key, values in self.observations.items() if values.ndim == 4]
-
-    @property
-    def vectors(self) -> list[str]:
-        """Observations that are vectors."""
-        return [key for key, values in self.observations.items() if values.ndim == 2]
+    def observed(self, ndim: int) -> dict[str, Array]:
+        """Observations that are images (T, H, W, C), with 4 dimensions, or vectors (T, D), with 2."""
+        return {key: values for key, values in self.episode.observations.items() if values.ndim == ndim}
 
 
 class DecisionRecorder:
@@ -115,12 +82,15 @@ class DecisionRecorder:
         generator.set_state(decision.noise)
         alone = self.guided.act(decision.history, torch.zeros_like(decision.strength))
         generator.set_state(noise)
-        student = pair.student_actions(decision.history)
-        chunks = Chunks(_first(alone.actions), _first(decision.chunks.actions), _first(student))
+        actions = {
+            "teacher": alone.actions,
+            "guided": decision.chunks.actions,
+            "student": pair.student_actions(decision.history),
+        }
         self.decisions.append(
             DecisionRecord(
                 step=len(self.decisions) * pair.n_steps,
-                chunks=chunks,
+                chunks={name: chunk[0].float().cpu().numpy() for name, chunk in actions.items()},
                 teacher_discrepancy=float(alone.discrepancy[0]),
                 guided_discrepancy=float(decision.chunks.discrepancy[0]),
                 guidance_shift=float(decision.chunks.guidance_shift[0]),
@@ -161,13 +131,8 @@ class FrameRecorder(VectorWrapper):
                 f"rendering failed ({error}). MuJoCo environments need an OpenGL backend: set the environment variable "
                 "MUJOCO_GL=egl (GPU or Mesa) or MUJOCO_GL=osmesa (software); or record without frames: --render=false"
             ) from error
-        frame = rendered[0] if rendered else None
-        if not isinstance(frame, np.ndarray):
+        if not rendered or not isinstance(rendered[0], np.ndarray):
             raise RuntimeError(
                 "the environment renders no pictures; pass --env.render_mode=rgb_array or --render=false"
             )
-        return frame
-
-
-def _first(chunks: Tensor) -> Array:
-    return chunks[0].float().cpu().numpy()
+        return rendered[0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,9 @@ from lerobot_agpd.studies.tables import (
     results_table,
     summary_table,
 )
+
+SAME = ("packages", "teacher", "demonstrations")
+"""What all runs of a task should have been made with, beside the code."""
 
 NOTES = """\
 Success counts at any step of an episode, as LeRobot evaluates; starts that are solved already count too, for every
@@ -127,58 +130,40 @@ def _notes(matrix: Matrix, results: Mapping[str, Methods]) -> list[str]:
 
 
 def _remarks(results: Mapping[str, Methods], missing: Sequence[str]) -> list[str]:
-    everything = [result for methods in results.values() for runs in methods.values() for result in runs]
-    remarks = _interruptions(everything) + _software(everything)
-    for task, methods in results.items():
-        remarks += _other_inputs(task, methods)
+    everything = {
+        task: [run for runs in methods.values() for run in runs] for task, methods in results.items()
+    }
+    remarks = []
+    runs = [run for task in everything.values() for run in task]
+    if early := [f"{run.name} ({run.rounds_adopted})" for run in runs if run.rounds_adopted]:
+        remarks.append(
+            "- Interrupted runs whose student met collected rounds earlier than an uninterrupted one's (number of "
+            f"rounds): {', '.join(early)}."
+        )
+    if len(states := frozenset[str]().union(*(run.made_with["code"] for run in runs))) > 1:
+        remarks.append(
+            f"- The code went through {len(states)} states meanwhile; each `run.json` names its own."
+        )
+    remarks += [
+        remark
+        for task, its_runs in everything.items()
+        for kind in SAME
+        for remark in _unlike(task, its_runs, kind)
+    ]
     if missing:
         remarks.append(f"- **Not finished: {_by_seeds(missing)}.**")
     return ["\n".join(remarks)] if remarks else []
 
 
-def _interruptions(results: Sequence[RunResult]) -> list[str]:
-    early = [f"{result.name} ({result.rounds_adopted})" for result in results if result.rounds_adopted]
-    if not early:
-        return []
-    return [
-        "- Interrupted runs whose student met collected rounds earlier than an uninterrupted one's (number of "
-        f"rounds): {', '.join(early)}."
-    ]
-
-
-def _software(results: Sequence[RunResult]) -> list[str]:
-    remarks = []
-    commits = set[str]().union(*(result.commits for result in results))
-    if len(commits) > 1:
-        remarks.append(
-            f"- The code went through {len(commits)} states meanwhile; each `run.json` names its own."
-        )
-    packages = set[frozenset[str]]().union(*(result.packages for result in results))
-    if len(packages) > 1:
-        common = frozenset.intersection(*packages)
-        kinds = sorted(", ".join(sorted(kind - common)) for kind in packages)
-        remarks.append(f"- **Not all was made with the same packages: {'; '.join(kinds)}.**")
-    return remarks
-
-
-def _other_inputs(task: str, methods: Methods) -> list[str]:
-    """Remarks on a task's runs that did not start from the same files: a teacher trained again is another teacher."""
-    results = [result for runs in methods.values() for result in runs]
-    teachers = {result.run.flags.get("policy.teacher.path") for result in results}
-    evaluated = {result.weights for result in results if result.run.policy in teachers and result.weights}
-    remarks = []
-    for kind in ("teacher", "demonstrations"):
-        by_file: dict[str, list[str]] = {}
-        for result in results:
-            if fingerprint := result.inputs.get(kind):
-                by_file.setdefault(fingerprint, []).append(result.name)
-        different = by_file.keys() | (evaluated if kind == "teacher" else set())
-        if len(different) > 1:
-            groups = "; ".join(f"{file[:9]}: {_by_seeds(names)}" for file, names in sorted(by_file.items()))
-            remarks.append(
-                f"- **Not all of {task} had the same {kind}; those recorded, by fingerprint: {groups}.**"
-            )
-    return remarks
+def _unlike(task: str, runs: Sequence[RunResult], kind: str) -> Iterator[str]:
+    """A remark if a task's runs were not all made with the same: a teacher trained again is another teacher."""
+    groups: dict[str, list[str]] = {}
+    for run in runs:
+        for fingerprint in run.made_with.get(kind, ()):
+            groups.setdefault(fingerprint, []).append(run.name)
+    if len(groups) > 1:
+        named = " / ".join(_by_seeds(names) for names in groups.values())
+        yield f"- **Not all of {task} was made with the same {kind}: {named}.**"
 
 
 def _by_seeds(runs: Sequence[str]) -> str:

@@ -21,7 +21,8 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from lerobot_agpd.studies.recording import COLORS, LABELS, Array, DecisionRecord, RolloutRecord
+from lerobot_agpd.replay.episode import Array
+from lerobot_agpd.studies.recording import COLORS, LABELS, DecisionRecord, RolloutRecord
 
 TIMELINE = "step"
 JPEG_QUALITY = 85
@@ -32,16 +33,17 @@ POINT_RADIUS = np.asarray(rr.Radius.ui_points(5))
 
 def log_rollout(stream: rr.RecordingStream, root: str, rollout: RolloutRecord) -> None:
     """Log everything a rollout holds under the entity `root`."""
-    steps = np.arange(len(rollout.actions))
+    episode = rollout.episode
+    steps = np.arange(len(episode))
     _log_images(stream, f"{root}/frame", rollout.frames)
-    for key in rollout.cameras:
-        _log_images(stream, _observation_path(root, key), rollout.observations[key])
-    for key in rollout.vectors:
-        _log_series(stream, _observation_path(root, key), steps, rollout.observations[key])
-    _log_series(stream, f"{root}/action", steps, rollout.actions)
-    _log_series(stream, f"{root}/reward", steps, rollout.rewards[:, None], ["reward"])
-    if rollout.successes is not None:
-        _log_series(stream, f"{root}/success", steps, rollout.successes[:, None], ["success"])
+    for key, images in rollout.observed(ndim=4).items():
+        _log_images(stream, _observation_path(root, key), images)
+    for key, vectors in rollout.observed(ndim=2).items():
+        _log_series(stream, _observation_path(root, key), steps, vectors)
+    _log_series(stream, f"{root}/action", steps, episode.actions)
+    _log_series(stream, f"{root}/reward", steps, episode.rewards[:, None], ["reward"])
+    if episode.successes is not None:
+        _log_series(stream, f"{root}/success", steps, episode.successes[:, None], ["success"])
     if rollout.decisions:
         _log_decisions(stream, root, rollout.decisions)
     if rollout.to_frame is not None:
@@ -50,17 +52,12 @@ def log_rollout(stream: rr.RecordingStream, root: str, rollout: RolloutRecord) -
 
 def layout(root: str, rollout: RolloutRecord) -> rrb.Container:
     """Arrange one rollout: what happened on the left, what was planned and how it was guided on the right."""
-    pictures = [_observation_path(root, key) for key in rollout.cameras]
+    pictures = [_observation_path(root, key) for key in rollout.observed(ndim=4)]
     if len(rollout.frames) or rollout.to_frame is not None:
         pictures.insert(0, f"{root}/frame")
-    chunks = rrb.Grid(
-        *(
-            rrb.TimeSeriesView(origin=f"{root}/chunk/{dim}", name=f"action {dim}")
-            for dim in range(rollout.actions.shape[1])
-        ),
-        grid_columns=min(rollout.actions.shape[1], MAX_SERIES_COLUMNS),
-        name="chunks",
-    )
+    n_dims = rollout.episode.actions.shape[1]
+    dims = (rrb.TimeSeriesView(origin=f"{root}/chunk/{dim}", name=f"action {dim}") for dim in range(n_dims))
+    chunks = rrb.Grid(*dims, grid_columns=min(n_dims, MAX_SERIES_COLUMNS), name="chunks")
     guidance = rrb.Horizontal(
         rrb.TimeSeriesView(origin=f"{root}/discrepancy", name="discrepancy J"),
         rrb.TimeSeriesView(origin=f"{root}/guidance_shift", name="shift in sigmas"),
@@ -70,7 +67,10 @@ def layout(root: str, rollout: RolloutRecord) -> rrb.Container:
     )
     state = rrb.Tabs(
         rrb.TimeSeriesView(origin=f"{root}/action", name="executed actions"),
-        *(rrb.TimeSeriesView(origin=_observation_path(root, key), name=key) for key in rollout.vectors),
+        *(
+            rrb.TimeSeriesView(origin=_observation_path(root, key), name=key)
+            for key in rollout.observed(ndim=2)
+        ),
     )
     plots = rrb.Vertical(chunks, guidance, state, row_shares=[2, 1, 1])
     if not pictures:
@@ -90,9 +90,9 @@ def _observation_path(root: str, key: str) -> str:
 
 
 def _log_decisions(stream: rr.RecordingStream, root: str, decisions: Sequence[DecisionRecord]) -> None:
-    planned = np.concatenate([d.step + np.arange(len(d.chunks.guided)) for d in decisions])
+    planned = np.concatenate([d.step + np.arange(len(d.chunks["guided"])) for d in decisions])
     for name in COLORS:
-        chunks = np.concatenate([getattr(d.chunks, name) for d in decisions])  # (decisions * n, A)
+        chunks = np.concatenate([d.chunks[name] for d in decisions])  # (decisions * n, A)
         for dim in range(chunks.shape[1]):
             path = f"{root}/chunk/{dim}/{name}"
             _log_series(stream, path, planned, chunks[:, [dim]], [LABELS[name]], [COLORS[name]])
@@ -113,12 +113,12 @@ def _log_overlay(
     for name, color in COLORS.items():
         line = rr.LineStrips2D.from_fields(colors=[color], radii=LINE_RADIUS, draw_order=20)
         stream.log(f"{path}/{name}", line, static=True)
-        strips = [to_frame(getattr(d.chunks, name)) for d in rollout.decisions]
+        strips = [to_frame(d.chunks[name]) for d in rollout.decisions]
         stream.send_columns(f"{path}/{name}", [index], rr.LineStrips2D.columns(strips=strips))
     point = rr.Points2D.from_fields(colors=[COLORS["guided"]], radii=POINT_RADIUS, draw_order=30)
     stream.log(f"{path}/executed", point, static=True)
-    index = rr.TimeColumn(TIMELINE, sequence=np.arange(len(rollout.actions)))
-    positions = rr.Points2D.columns(positions=to_frame(rollout.actions))
+    index = rr.TimeColumn(TIMELINE, sequence=np.arange(len(rollout.episode)))
+    positions = rr.Points2D.columns(positions=to_frame(rollout.episode.actions))
     stream.send_columns(f"{path}/executed", [index], positions)
 
 

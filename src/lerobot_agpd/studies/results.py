@@ -58,9 +58,7 @@ class RunResult(Result):
         steps: gradient steps; None for a policy that is only evaluated.
         seconds: wall-clock by activity, and in total.
         rounds_adopted: rounds that an interrupted run's student met earlier than an uninterrupted one's.
-        commits: of this project's code, in training and evaluation.
-        packages: versions of the others, one set of texts for each start.
-        inputs: fingerprints of the files that its training started from, by kind.
+        made_with: kind (code, packages, teacher, demonstrations) to what it was made with, normally one of each.
         weights: digest of the weights of a policy that was only evaluated.
     """
 
@@ -68,9 +66,7 @@ class RunResult(Result):
     steps: int | None
     seconds: Mapping[str, float]
     rounds_adopted: int
-    commits: frozenset[str]
-    packages: frozenset[frozenset[str]]
-    inputs: Mapping[str, str] = field(default_factory=dict)
+    made_with: Mapping[str, frozenset[str]]
     weights: str | None = None
 
 

@@ -3,48 +3,41 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict
 from typing import Any
 
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 
+from lerobot_agpd.config import require
 from lerobot_agpd.files import read_json, write_json
-from lerobot_agpd.rollout.report import RoundReport
-from lerobot_agpd.studies.evaluation import (
-    Environments,
-    Evaluation,
-    Evaluator,
-    best_step,
-    checkpoint_steps,
-)
+from lerobot_agpd.rollout.report import RoundReport, read_reports
+from lerobot_agpd.studies.evaluation import Evaluation, Evaluator, best_step, checkpoint_steps
 from lerobot_agpd.studies.latency import Latency
 from lerobot_agpd.studies.matrix import Matrix
 from lerobot_agpd.studies.parsing import decode_environment
 from lerobot_agpd.studies.provenance import digest, provenance
 from lerobot_agpd.studies.results import CHECKPOINTS, RunResult
 from lerobot_agpd.studies.runs import Run, expand
-from lerobot_agpd.studies.training import progress, read_starts, train_command
+from lerobot_agpd.studies.training import is_trained, read_starts, replay_folder, train_command
+
+logger = logging.getLogger(__name__)
 
 RESULT = "run.json"
 
 
-def evaluate_run(matrix: Matrix, run: Run, rounds: Sequence[RoundReport]) -> None:
+def evaluate_run(matrix: Matrix, run: Run) -> None:
     """Evaluate what is missing of a finished run, or of a policy that is only evaluated, and write `run.json`.
 
-    Args:
-        matrix: the comparison.
-        run: one of its runs.
-        rounds: reports of its collection rounds.
-
     Raises:
-        ValueError: if the run's training is not finished.
+        FlagError: if the run's training is not finished.
     """
-    task, settings = matrix.tasks[run.task], matrix.evaluation
-    with Environments(decode_environment(task.env), settings.batch_size) as environments:
-        evaluator = Evaluator(environments, run.folder, settings.device)
-        parts = _evaluate_policy if run.policy else _evaluate_training
-        measured = parts(matrix, run, evaluator)
+    env_config, settings = decode_environment(matrix.tasks[run.task].env), matrix.evaluation
+    with closing(Evaluator(env_config, settings.batch_size, run.folder, settings.device)) as evaluator:
+        measured = (_evaluate_policy if run.policy else _evaluate_training)(matrix, run, evaluator)
+    rounds = read_reports(replay_folder(run))
     content = {
         "task": run.task,
         "method": run.method,
@@ -81,27 +74,27 @@ def _evaluate_policy(matrix: Matrix, run: Run, evaluator: Evaluator) -> dict[str
 
 
 def _evaluate_training(matrix: Matrix, run: Run, evaluator: Evaluator) -> dict[str, Any]:
-    settings, trained = matrix.evaluation, progress(run)
-    if trained is None or not trained.finished:
-        raise ValueError(f"{run.name} is not trained yet; run without --only=evaluate")
+    settings = matrix.evaluation
+    require(is_trained(run), f"{run.name} is not trained yet; run without --only=evaluate")
     paths = checkpoint_steps(run.output_dir)
     curve = {
         step: evaluator.evaluate(path, settings.curve_episodes, settings.curve_seed)
         for step, path in paths.items()
     }
-    chosen = {"best": best_step(curve, matrix.tasks[run.task].measure), "last": trained.step}
+    last = max(paths)
+    chosen = {"best": best_step(curve, matrix.tasks[run.task].measure), "last": last}
     finals = {
         which: {"step": step, **asdict(evaluator.evaluate(paths[step], settings.episodes, settings.seed))}
         for which, step in chosen.items()
     }
-    last, starts = paths[trained.step], read_starts(run)
+    starts = read_starts(run)
     return {
         "command": starts[0]["command"] if starts else train_command(run),
-        "config": read_json(last / TRAIN_CONFIG_NAME),
-        "steps": trained.steps,
+        "config": read_json(paths[last] / TRAIN_CONFIG_NAME),
+        "steps": last,
         "curve": {step: asdict(evaluation) for step, evaluation in curve.items()},
         **finals,
-        "latency": asdict(evaluator.latency(last)),
+        "latency": asdict(evaluator.latency(paths[last])),
     }
 
 
@@ -114,17 +107,12 @@ def _seconds(run: Run, rounds: Sequence[RoundReport]) -> dict[str, float]:
     return seconds
 
 
-def read_result(
-    run: Run,
-    matrix: Matrix,
-    translate: Callable[[dict[str, Any]], dict[str, Any]] = lambda content: content,
-) -> RunResult | None:
-    """Read the result of a run; None if it has none yet.
+Translate = Callable[[dict[str, Any]], dict[str, Any]]
+"""Applied to the JSON of a result before it is checked."""
 
-    Args:
-        run: the run.
-        matrix: its comparison.
-        translate: applied to the JSON before it is checked.
+
+def read_result(run: Run, matrix: Matrix, translate: Translate = lambda content: content) -> RunResult | None:
+    """Read the result of a run of a matrix; None if it has none yet.
 
     Raises:
         ValueError: if the file is damaged, or was made with other flags or evaluation settings.
@@ -139,15 +127,14 @@ def read_result(
                 raise ValueError(
                     f"{path} was made with other {key} than the matrix has now; run the comparison again"
                 )
-        return _result(run, content)
+        return _result(run, matrix, content)
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(
             f"{path} is damaged ({error!r}); remove it and run the comparison again: finished parts are kept"
         ) from error
 
 
-def _result(run: Run, content: Mapping[str, Any]) -> RunResult:
-    software = (*content["starts"], content["evaluated_with"])
+def _result(run: Run, matrix: Matrix, content: Mapping[str, Any]) -> RunResult:
     return RunResult(
         name=run.name,
         run=run,
@@ -158,39 +145,44 @@ def _result(run: Run, content: Mapping[str, Any]) -> RunResult:
         rounds=[RoundReport.from_json(entry) for entry in content["rounds"]],
         seconds=content["seconds"],
         rounds_adopted=sum(start["rounds_adopted"] for start in content["starts"]),
-        commits=frozenset(_commit(entry["git"]) for entry in software),
-        packages=frozenset(_packages(entry["versions"]) for entry in software),
-        inputs=content["starts"][0].get("inputs", {}) if content["starts"] else {},
+        made_with=_made_with(run, matrix, content),
         weights=content.get("weights"),
     )
+
+
+def _made_with(run: Run, matrix: Matrix, content: Mapping[str, Any]) -> dict[str, frozenset[str]]:
+    """What runs of a comparison should have in common, by kind."""
+    software = (*content["starts"], content["evaluated_with"])
+    files = dict(content["starts"][0].get("inputs", {})) if content["starts"] else {}
+    if run.policy == matrix.tasks[run.task].teacher and content.get("weights"):
+        files["teacher"] = content["weights"]
+    return {
+        "code": frozenset(str(entry["git"]) for entry in software),
+        "packages": frozenset(json.dumps(entry["versions"], sort_keys=True) for entry in software),
+        **{kind: frozenset([fingerprint]) for kind, fingerprint in files.items()},
+    }
 
 
 def _evaluation(entry: Mapping[str, Any]) -> Evaluation:
     return Evaluation(**{key: value for key, value in entry.items() if key != "step"})
 
 
-def _commit(git: Mapping[str, Any] | None) -> str:
-    return f"{git['commit'][:9]}{' (modified)' if git['modified'] else ''}" if git else "no checkout"
-
-
-def _packages(versions: Mapping[str, str]) -> frozenset[str]:
-    return frozenset(f"{name} {number}" for name, number in versions.items())
-
-
 def read_results(
-    matrix: Matrix, read: Callable[[Run, Matrix], RunResult | None] = read_result
+    matrix: Matrix, translate: Translate = lambda content: content
 ) -> tuple[dict[str, dict[str, list[RunResult]]], list[str]]:
     """Results of a matrix by task and method, in its order, and the names of runs that have none.
 
-    Methods that were never begun on a task are not named: they are no part of the report.
-
-    Raises:
-        ValueError: as `read` does.
+    A damaged or outdated result counts as missing. Methods that were never begun on a task are not named: they are
+    no part of the report.
     """
     results: dict[str, dict[str, list[RunResult]]] = {}
     missing = []
     for run in expand(matrix):
-        result = read(run, matrix)
+        try:
+            result = read_result(run, matrix, translate)
+        except ValueError as error:
+            logger.warning("left out of the report: %s", error)
+            result = None
         if result is not None:
             results.setdefault(run.task, {}).setdefault(run.method, []).append(result)
         elif run.folder.parent.exists():

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot_agpd.config import require
+from lerobot_agpd.config import FlagError, require
 from lerobot_agpd.studies.matrix import Matrix, TaskEntry, flat
 from lerobot_agpd.studies.parsing import decode_environment, parse_train_flags
 
@@ -70,20 +70,20 @@ def expand(
     ):
         unknown = [entry for entry in requested if entry not in present]
         require(not unknown, f"--{flag}: the matrix has no {unknown}; there are {present}")
+    cells = [(task, method) for task in tasks or matrix.tasks for method in methods or matrix.methods]
     runs = []
     for number, seed in enumerate(seeds or matrix.seeds):
-        for task in tasks or matrix.tasks:
-            for method in methods or matrix.methods:
-                if not matrix.methods[method].policy:
-                    runs.append(_trained(matrix, task, method, seed))
-                elif number == 0:
-                    runs.append(_evaluated(matrix, task, method))
+        for task, method in cells:
+            if not matrix.methods[method].policy:
+                runs.append(_trained(matrix, task, method, seed))
+            elif number == 0:
+                runs.append(_evaluated(matrix, task, method))
     return runs
 
 
 def _trained(matrix: Matrix, task_name: str, method_name: str, seed: int) -> Run:
     task, method = matrix.tasks[task_name], matrix.methods[method_name]
-    flags = {**flat(matrix.common), **flat({"dataset": task.dataset, "env": task.env}), **flat(task.flags)}
+    flags = flat(matrix.common) | flat({"dataset": task.dataset, "env": task.env}) | flat(task.flags)
     if method.teacher:
         flags["policy.teacher.path"] = task.teacher
     flags |= {name: _fill_in(value, task) for name, value in flat(method.flags).items()}
@@ -95,8 +95,9 @@ def _evaluated(matrix: Matrix, task_name: str, method_name: str) -> Run:
     task = matrix.tasks[task_name]
     policy = _fill_in(matrix.methods[method_name].policy, task)
     flags = {"policy.path": policy, **flat({"env": task.env})}
-    folder = matrix.output / task_name / method_name / "policy"
-    return Run(task_name, method_name, None, folder, flags, policy)
+    return Run(
+        task_name, method_name, None, matrix.output / task_name / method_name / "policy", flags, policy
+    )
 
 
 def _fill_in(value: Any, task: TaskEntry) -> Any:
@@ -115,17 +116,13 @@ def check(matrix: Matrix, runs: Sequence[Run]) -> None:
             missing = _missing(run)
             require(not missing, f"{', '.join(missing)} does not exist")
             if not run.policy:
-                check_flags(run)
-        except ValueError as error:
+                _check_flags(run)
+        except (ValueError, FlagError) as error:
             raise ValueError(f"task '{run.task}', method '{run.method}': {error}") from error
 
 
-def check_flags(run: Run) -> None:
-    """Parse a run's flags.
-
-    Raises:
-        ValueError: for a flag or value that LeRobot refuses, or one that a comparison cannot have.
-    """
+def _check_flags(run: Run) -> None:
+    """Refuse a flag or value that LeRobot refuses, or one that a comparison cannot have."""
     config = parse_train_flags(run.args)
     require(
         not getattr(config.policy, "push_to_hub", False),

@@ -59,7 +59,7 @@ def _draw_on_frame(rollout: RolloutRecord, decision: DecisionRecord) -> Figure:
 
 def _draw_dimensions(rollout: RolloutRecord, decision: DecisionRecord) -> Figure:
     """Draw a plot per action dimension, J, and the frame if there is one."""
-    n_dims = rollout.actions.shape[1]
+    n_dims = rollout.episode.actions.shape[1]
     n_columns = 1 if n_dims < 2 else 2 if n_dims <= 8 else 4
     n_rows = -(-n_dims // n_columns)
     figure = Figure(figsize=(5 + 3.2 * n_columns, max(6, 1.8 * n_rows)), layout="constrained", dpi=120)

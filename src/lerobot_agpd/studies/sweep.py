@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -68,10 +68,6 @@ class SweepRow:
     entropy_kept: float | None
     coverage: float
 
-    def to_json(self) -> dict[str, Any]:
-        """Plain values."""
-        return asdict(self)
-
 
 def configured(student_config: StudentConfig, setting: Setting) -> StudentConfig:
     """The student's configuration with one setting's strategy."""
@@ -83,10 +79,11 @@ def configured(student_config: StudentConfig, setting: Setting) -> StudentConfig
     return config
 
 
+@dataclass(frozen=True)
 class Sweep:
     """Measure settings against each other: same environment seeds, same observations, same numbers of states.
 
-    Args:
+    Attributes:
         student_config: the student's configuration; its `collect` group filters.
         env_config: the environment.
         stats: statistics that standardize states.
@@ -94,16 +91,11 @@ class Sweep:
         noise_seed: of all sampling.
     """
 
-    def __init__(
-        self,
-        student_config: StudentConfig,
-        env_config: EnvConfig,
-        stats: Statistics,
-        seeds: Sequence[int],
-        noise_seed: int,
-    ):
-        self.student_config, self.env_config = student_config, env_config
-        self.stats, self.seeds, self.noise_seed = stats, seeds, noise_seed
+    student_config: StudentConfig
+    env_config: EnvConfig
+    stats: Statistics
+    seeds: Sequence[int]
+    noise_seed: int
 
     def episodes(
         self,

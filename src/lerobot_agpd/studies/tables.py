@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
+from rich.table import Table
 
 from lerobot_agpd.rollout.report import RoundReport, Tally, success_rate
 from lerobot_agpd.studies.evaluation import MEASURES
@@ -38,6 +39,15 @@ def markdown(rows: Iterable[Sequence[str]]) -> str:
     header, *body = rows
     lines = [header, ["---"] * len(header), *body]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def console_table(rows: Iterable[Sequence[str]]) -> Table:
+    """A table for the console."""
+    header, *body = rows
+    table = Table(*header)
+    for row in body:
+        table.add_row(*row)
+    return table
 
 
 # ---- the report of some runs ----
@@ -219,5 +229,5 @@ def rounds_table(rounds: Sequence[RoundReport]) -> list[Row]:
 
 
 def _successes(tally: Tally) -> str:
-    counted = tally.generated - tally.solved_at_start
+    counted = tally.generated - tally.solved_at_start - tally.invalid
     return f"{tally.successful} / {counted}" if counted else "-"

@@ -36,7 +36,7 @@ def effective_variance(
 
 
 def coverage_bound(
-    sigma: float, epsilon: float, n: int, dim: int, a: float | NDArray[np.floating], c: float = GAUSSIAN_C
+    sigma: float, epsilon: float, n: int, dim: int, a: float | NDArray[np.floating]
 ) -> NDArray[np.floating]:
     """Lower bound on the next-state coverage P_S, as printed in Eq. 4; with sigma_eff it is Eq. 5.
 
@@ -47,11 +47,11 @@ def coverage_bound(
         ValueError: for a < 1, and where (c epsilon / sigma)^d exp(-a^2 d), which stands for a probability, exceeds 1.
     """
     a = np.asarray(a, dtype=float)
-    log_mass = dim * (math.log(c * epsilon / sigma) - a**2)
+    log_mass = dim * (math.log(GAUSSIAN_C * epsilon / sigma) - a**2)
     if np.any(a < 1) or np.any(log_mass > 0):
         raise ValueError(
             f"Eq. 4 needs a >= 1 and c epsilon / sigma <= exp(a^2), got a = {a.min():.3g} and "
-            f"c epsilon / sigma = {c * epsilon / sigma:.3g}"
+            f"c epsilon / sigma = {GAUSSIAN_C * epsilon / sigma:.3g}"
         )
     with np.errstate(divide="ignore"):  # a mass of 1 is a sure hit: log(0), exp(-inf) = 0
         log_miss = n * np.log1p(-np.exp(log_mass))

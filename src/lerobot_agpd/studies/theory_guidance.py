@@ -171,11 +171,6 @@ class Comparison:
     kl_guided: float
     kl_mixed: float
 
-    @property
-    def eq_15_holds(self) -> bool:
-        """Whether guidance keeps the mean strictly closer to the teacher's than mixing."""
-        return self.guided.fraction < self.mixed.fraction
-
 
 def compare(policies: Policies, lam: float, tilt: Tilt, mixing: Mixing, printed: bool = False) -> Comparison:
     """Solve Theorem 3.3 for k, then compare both methods' distance to the teacher (Eq. 14-15).

@@ -13,7 +13,6 @@ from lerobot.utils.feature_utils import dataset_to_policy_features  # noqa: E402
 from robomimic_files import ENV_ARGS, LENGTHS, Rollout, column, run_import, write  # noqa: E402
 
 from lerobot_agpd.envs.robomimic_hdf5 import RobomimicFile, sha256  # noqa: E402
-from lerobot_agpd.envs.robomimic_recordings import load_recording  # noqa: E402
 from lerobot_agpd.envs.robomimic_tasks import TASKS, key_dim  # noqa: E402
 
 AGENT = ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos")
@@ -69,7 +68,7 @@ def test_a_policy_sees_what_the_environment_type_shows(imported):
     assert {key: tuple(features[key].shape) for key in shown} == shown
 
 
-def test_provenance(imported, source, rollouts):
+def test_provenance(imported, source):
     report = json.loads((imported.root / "meta/robomimic.json").read_text())
     assert report["source"] == {
         "file": source.name,
@@ -81,18 +80,17 @@ def test_provenance(imported, source, rollouts):
     assert [(row["demo"], row["length"]) for row in report["episodes"]] == [
         (f"demo_{i}", length) for i, length in enumerate(LENGTHS)
     ]
-    for episode, rollout in enumerate(rollouts):
-        recording = load_recording(imported.root, f"demo_{episode}")
-        for key in ("actions", "states", "rewards", "dones"):
-            stored = getattr(recording, key)
-            assert stored.dtype == rollout.arrays[key].dtype
-            np.testing.assert_array_equal(stored, rollout.arrays[key])
-        assert recording.model_xml == rollout.attributes["model_file"]
 
 
-def test_recordings_are_a_raw_robomimic_file(imported):
+def test_recordings_are_a_raw_robomimic_file(imported, rollouts):
     with RobomimicFile(imported.root / "meta/robomimic.hdf5") as file:
         assert file.demos == [f"demo_{i}" for i in range(4)]
+        for demo, rollout in zip(file.demos, rollouts, strict=True):
+            for key in ("actions", "states", "rewards", "dones"):
+                stored = file.read(demo, key)
+                assert stored.dtype == rollout.arrays[key].dtype
+                np.testing.assert_array_equal(stored, rollout.arrays[key])
+            assert file.model_xml(demo) == rollout.attributes["model_file"]
         with pytest.raises(ValueError, match="has no obs"):
             file.observation_shapes("demo_0")
 
@@ -147,8 +145,8 @@ def test_rewards_and_dones_may_be_missing(rollouts, tmp_path, caplog):
     assert "rewards" in caplog.text and "dones" in caplog.text
     assert (dataset.num_episodes, dataset.num_frames) == (2, 11)
     assert not {"next.reward", "next.success", "next.done"} & set(dataset.features)
-    recording = load_recording(dataset.root, "demo_0")
-    assert recording.rewards is None and recording.dones is None
+    with RobomimicFile(dataset.root / "meta/robomimic.hdf5") as file:
+        assert not {"rewards", "dones"} & set(file.data["demo_0"])
 
 
 def test_dones_alone_may_be_missing(rollouts, tmp_path):

@@ -9,7 +9,8 @@ pytestmark = pytest.mark.slow
 
 from robomimic_files import column, make_lift, record, run_import, write  # noqa: E402
 
-from lerobot_agpd.envs.robomimic_recordings import load_recording  # noqa: E402
+from lerobot_agpd.envs.robomimic_hdf5 import RobomimicFile  # noqa: E402
+from lerobot_agpd.envs.robomimic_recordings import RECORDINGS_PATH  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -25,19 +26,21 @@ def imported(tmp_path_factory):
 def test_recorded_actions_replayed_reproduce_the_recording(imported):
     from lerobot_agpd.envs.robosuite_sim import RobosuiteEnv
 
-    recording = load_recording(imported.root, "demo_1")
+    with RobomimicFile(imported.root / RECORDINGS_PATH) as file:
+        actions, recorded_states = (file.read("demo_1", key) for key in ("actions", "states"))
+        model_xml = file.model_xml("demo_1")
     env = RobosuiteEnv("lift")
-    observation, _ = env.reset_to(recording.states[0], recording.model_xml)
+    observation, _ = env.reset_to(recorded_states[0], model_xml)
     states, successes, observations = [], [], []
-    for action in recording.actions:
+    for action in actions:
         states.append(env.get_state())
         observations.append(observation)
         observation, *_, info = env.step(action)
         successes.append(info["is_success"])
     env.close()
-    np.testing.assert_allclose(states, recording.states, atol=1e-3)
+    np.testing.assert_allclose(states, recorded_states, atol=1e-3)
     positions = slice(1, 17)  # after the time: seven joints, two fingers, the cube's position and quaternion
-    np.testing.assert_allclose(np.array(states)[:, positions], recording.states[:, positions], atol=1e-4)
+    np.testing.assert_allclose(np.array(states)[:, positions], recorded_states[:, positions], atol=1e-4)
     assert successes == column(imported, "next.success", 1).ravel().tolist() and successes[-1]
     for raw, key in (
         ("agent_pos", "observation.state"),

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from lerobot_agpd.envs.base import AGENT_POS
 from lerobot_agpd.envs.experts.aloha_kinematics import HandPoses, arm_kinematics, rotation_vectors
 from lerobot_agpd.envs.experts.aloha_servos import position_servos
-from lerobot_agpd.envs.experts.base import Array, Expert, Observation, ramp, state_vectors
+from lerobot_agpd.envs.experts.base import Array, Expert, Observation, descend, ramp, state_vectors
 
 # Places among the 14 numbers of `agent_pos` and of an action.
 ARM_JOINTS = np.array([range(6), range(7, 13)])  # (2, 6)
@@ -48,22 +48,43 @@ RIGHT_POINTS = RIGHT_ROTATION.as_matrix()[:, 0]
 
 
 @dataclass(frozen=True)
-class TransferScene:
-    """One observation of the transfer, by name. Positions (3,) in meters, world frame.
+class Hand:
+    """One hand and the cube.
 
     Attributes:
-        left: position of the left hand.
-        right: position of the right hand.
-        left_opening: of the left gripper, 0 closed, 1 open, 0.61 around the cube.
-        right_opening: of the right gripper.
-        cube: position of the cube's center.
+        position: (3,) of the hand, meters, world frame.
+        to_cube: (3,) from the hand to the cube's center.
+        opening: of the gripper, 0 closed, 1 open, 0.61 around the cube.
+    """
+
+    position: Array
+    to_cube: Array
+    opening: float
+
+    @property
+    def surrounds(self) -> float:
+        """How much the cube is between the fingers, in [0, 1]."""
+        return ramp(float(np.linalg.norm(self.to_cube)), zero_at=0.025, one_at=0.015)
+
+    @property
+    def holds(self) -> float:
+        """How much the hand has the cube, in [0, 1]."""
+        return self.surrounds * ramp(self.opening, zero_at=0.65, one_at=0.62)
+
+
+@dataclass(frozen=True)
+class TransferScene:
+    """One observation of the transfer, by name.
+
+    Attributes:
+        left: the left hand.
+        right: the right hand.
+        cube: (3,) position of the cube's center, meters, world frame.
         cube_heading: angle about the vertical of the cube's sides, radians, in [-pi/4, pi/4].
     """
 
-    left: Array
-    right: Array
-    left_opening: float
-    right_opening: float
+    left: Hand
+    right: Hand
     cube: Array
     cube_heading: float
 
@@ -75,29 +96,9 @@ class TransferScene:
             ValueError: if the shapes differ, for instance because the observation is batched.
         """
         agent, pose = state_vectors(observation, 14, 7)
-        left, right = hand_positions(observation)
-        openings = agent[GRIPPERS]
-        return cls(left, right, float(openings[0]), float(openings[1]), pose[:3], heading_of_sides(pose[3:]))
-
-    @property
-    def left_surrounds(self) -> float:
-        """How much the cube is between the left hand's fingers, in [0, 1]."""
-        return ramp(float(np.linalg.norm(self.cube - self.left)), zero_at=0.025, one_at=0.015)
-
-    @property
-    def right_surrounds(self) -> float:
-        """How much the cube is between the right hand's fingers, in [0, 1]."""
-        return ramp(float(np.linalg.norm(self.cube - self.right)), zero_at=0.025, one_at=0.015)
-
-    @property
-    def left_holds(self) -> float:
-        """How much the left hand has the cube, in [0, 1]."""
-        return self.left_surrounds * ramp(self.left_opening, zero_at=0.65, one_at=0.62)
-
-    @property
-    def right_holds(self) -> float:
-        """How much the right hand has the cube, in [0, 1]."""
-        return self.right_surrounds * ramp(self.right_opening, zero_at=0.65, one_at=0.62)
+        hands = zip(hand_positions(observation), agent[GRIPPERS], strict=True)
+        left, right = (Hand(position, pose[:3] - position, float(opening)) for position, opening in hands)
+        return cls(left, right, pose[:3], heading_of_sides(pose[3:]))
 
 
 def heading_of_sides(quaternion: Array) -> float:
@@ -106,9 +107,7 @@ def heading_of_sides(quaternion: Array) -> float:
     Args:
         quaternion: (4,) of the cube, w first. Which side is up does not matter.
     """
-    axes = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()[
-        :2
-    ]  # (2, 3), columns seen from above
+    axes = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()[:2]  # (2, 3), seen from above
     x, y = axes[:, np.argmax(np.linalg.norm(axes, axis=0))]  # the most horizontal one
     return float((np.arctan2(y, x) + np.pi / 4) % (np.pi / 2) - np.pi / 4)
 
@@ -119,7 +118,7 @@ def hand_rotations(scene: TransferScene) -> Array:
     The left one is always turned alike. The right one follows the sides of the cube until it has it, and then
     faces the left one: from aside its fingers would be in the left one's way.
     """
-    right = Rotation.from_euler("Z", (1.0 - scene.right_holds) * scene.cube_heading) * RIGHT_ROTATION
+    right = Rotation.from_euler("Z", (1.0 - scene.right.holds) * scene.cube_heading) * RIGHT_ROTATION
     return np.stack([LEFT_ROTATION.as_matrix(), right.as_matrix()])
 
 
@@ -147,30 +146,28 @@ def intend_transfer(observation: Observation) -> Array:
         ValueError: if the observation has other shapes.
     """
     scene = TransferScene.from_observation(observation)
-    left = _intention(_left_displacement(scene), closing=scene.left_surrounds)
-    right = _intention(_right_displacement(scene), closing=scene.right_surrounds * (1.0 - scene.left_holds))
+    left = _intention(_left_displacement(scene), closing=scene.left.surrounds)
+    right = _intention(_right_displacement(scene), closing=scene.right.surrounds * (1.0 - scene.left.holds))
     return np.stack([left, right])
 
 
 def _right_displacement(scene: TransferScene) -> Array:
     """Come down onto the cube in a funnel, take it to the meeting point; draw back once the left has it."""
-    to_cube = scene.cube - scene.right
-    sideways = float(np.linalg.norm(to_cube[:2]))
-    fingers_shut = (1.0 - scene.right_surrounds) * ramp(scene.right_opening, zero_at=0.95, one_at=0.8)
-    clearance = GRASP_CLEARANCE * max(ramp(sideways, zero_at=0.008, one_at=0.05), fingers_shut)
-    descend = to_cube + np.array([0.0, 0.0, clearance])
-    pick_up = (1.0 - scene.right_holds) * descend + scene.right_holds * (MEETING_POINT - scene.cube)
+    to_cube = scene.right.to_cube
+    fingers_shut = (1.0 - scene.right.surrounds) * ramp(scene.right.opening, zero_at=0.95, one_at=0.8)
+    approach = descend(to_cube, GRASP_CLEARANCE, fingers_shut)
+    pick_up = (1.0 - scene.right.holds) * approach + scene.right.holds * (MEETING_POINT - scene.cube)
     draw_back = to_cube - RETREAT * RIGHT_POINTS
-    return (1.0 - scene.left_holds) * pick_up + scene.left_holds * draw_back
+    return (1.0 - scene.left.holds) * pick_up + scene.left.holds * draw_back
 
 
 def _left_displacement(scene: TransferScene) -> Array:
     """Wait beside the meeting point, take the cube once it is held out there, and stay."""
     to_meeting_point = MEETING_POINT - scene.cube
     held_out = ramp(float(np.linalg.norm(to_meeting_point)), zero_at=0.03, one_at=0.015)
-    wait = MEETING_POINT + LEFT_STANDOFF - scene.left
-    take = held_out * (scene.cube - scene.left) + (1.0 - held_out) * wait
-    return (1.0 - scene.left_holds) * take + scene.left_holds * to_meeting_point
+    wait = MEETING_POINT + LEFT_STANDOFF - scene.left.position
+    take = held_out * scene.left.to_cube + (1.0 - held_out) * wait
+    return (1.0 - scene.left.holds) * take + scene.left.holds * to_meeting_point
 
 
 def joint_targets(observation: Observation, intention: Array) -> np.ndarray:

@@ -18,6 +18,21 @@ def ramp(value: float, zero_at: float, one_at: float) -> float:
     return float(np.clip((value - zero_at) / (one_at - zero_at), 0.0, 1.0))
 
 
+def descend(to_grasp: Array, clearance: float, fingers_shut: float) -> Array:
+    """Displacement (3,) that comes down onto a grasp in a funnel.
+
+    The hand keeps a height that falls with the horizontal distance to the grasp and with the opening of the fingers.
+
+    Args:
+        to_grasp: (3,) from where the hand is to where it closes.
+        clearance: largest height above the grasp, meters.
+        fingers_shut: 1 where the fingers have to open before they come down, 0 where they are open.
+    """
+    sideways = float(np.linalg.norm(to_grasp[:2]))
+    height = clearance * max(ramp(sideways, zero_at=0.008, one_at=0.05), fingers_shut)
+    return to_grasp + np.array([0.0, 0.0, height])
+
+
 def state_vectors(
     observation: Observation, agent_pos_dim: int, environment_state_dim: int
 ) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_agpd.envs.experts.base import Array, Expert, ramp, state_vectors
+from lerobot_agpd.envs.experts.base import Array, Expert, descend, ramp, state_vectors
 
 # Action units per meter of position error. An action of 1 asks for 5 cm in one step; the arm follows with a lag.
 POSITION_GAIN = 10.0
@@ -89,10 +89,8 @@ def fetch_pick_and_place_expert(observation: dict[str, np.ndarray]) -> np.ndarra
     between_fingers = ramp(float(np.linalg.norm(to_block)), zero_at=0.035, one_at=0.020)
     held = between_fingers * ramp(scene.width, zero_at=0.058, one_at=0.052)
 
-    sideways = float(np.linalg.norm(to_block[:2]))
     fingers_shut = (1.0 - between_fingers) * ramp(scene.width, zero_at=0.09, one_at=0.07)
-    clearance = GRASP_CLEARANCE * max(ramp(sideways, zero_at=0.008, one_at=0.05), fingers_shut)
-    approach = to_block + np.array([0.0, 0.0, clearance])
+    approach = descend(to_block, GRASP_CLEARANCE, fingers_shut)
     carry = scene.goal - scene.block
     gripper = OPEN + (CLOSE - OPEN) * between_fingers
     return _action((1.0 - held) * approach + held * carry, gripper)

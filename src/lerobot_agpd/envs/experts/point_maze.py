@@ -9,6 +9,7 @@ from typing import Self
 
 import numpy as np
 
+from lerobot_agpd.config import require
 from lerobot_agpd.envs.base import AGENT_POS
 from lerobot_agpd.envs.experts.base import Array, Expert, Observation
 from lerobot_agpd.envs.ways import TASKS
@@ -89,13 +90,13 @@ class WaysExpert:
         """The same expert with other probabilities of the ways.
 
         Raises:
-            ValueError: if there is not one per way, or they do not sum to 1.
+            FlagError: if there is not one per way, or they do not sum to 1.
         """
         n_ways = TASKS[self.task].n_ways
-        if len(fractions) != n_ways or min(fractions) < 0 or abs(sum(fractions) - 1) > 1e-6:
-            raise ValueError(
-                f"--ways={list(fractions)} must be {n_ways} fractions that sum to 1, one for each way of {self.task}."
-            )
+        require(
+            len(fractions) == n_ways and min(fractions) >= 0 and abs(sum(fractions) - 1) <= 1e-6,
+            f"--ways={list(fractions)} must be {n_ways} fractions that sum to 1, one for each way of {self.task}",
+        )
         return replace(self, fractions=tuple(fractions))
 
     def for_episode(self, rng: np.random.Generator) -> Expert:

@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lerobot_agpd.envs.experts.base import Array, Expert, Observation, ramp, state_vectors
+from lerobot_agpd.envs.experts.base import Array, Expert, Observation, descend, ramp, state_vectors
 from lerobot_agpd.envs.robomimic_tasks import TASKS
 
 # Action units per meter of position error. An action of 1 asks for 5 cm in one step, of which the arm does 1.1.
@@ -72,19 +72,9 @@ class PandaScene:
         )
 
     def approach(self, to_grasp: Array, between_fingers: float) -> Array:
-        """Displacement (3,) that descends onto the grasp in a funnel.
-
-        The hand keeps a height that falls with the horizontal distance to the grasp and with the opening of the
-        fingers.
-
-        Args:
-            to_grasp: (3,) from where the hand is to where it closes.
-            between_fingers: 1 where the object is between the fingers, 0 away from it.
-        """
-        sideways = float(np.linalg.norm(to_grasp[:2]))
+        """Displacement (3,) down onto a grasp, the object being between the fingers (1) or not yet (0)."""
         fingers_shut = (1.0 - between_fingers) * ramp(self.width, zero_at=0.075, one_at=0.065)
-        clearance = GRASP_CLEARANCE * max(ramp(sideways, zero_at=0.008, one_at=0.05), fingers_shut)
-        return to_grasp + np.array([0.0, 0.0, clearance])
+        return descend(to_grasp, GRASP_CLEARANCE, fingers_shut)
 
 
 def _intention(displacement: Array, gripper: float) -> Array:

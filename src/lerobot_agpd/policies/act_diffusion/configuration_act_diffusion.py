@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.act.configuration_act import ACTConfig
@@ -17,9 +16,6 @@ from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transfo
 
 RESNET_STRIDE = 32
 """Pixels per cell of the feature map that ACT's ResNet returns."""
-
-ACTDenoiser = Literal["transformer"]
-"""The only denoiser that attends to ACT's tokens."""
 
 
 def _default_head() -> TransformerDenoiserConfig:
@@ -48,7 +44,7 @@ class ACTDiffusionConfig(DiffusionTransformerConfig):
     do_mask_loss_for_padding: bool = True
 
     # Network that denoises; the transformer is the only one that attends to ACT's tokens.
-    denoiser: ACTDenoiser = "transformer"
+    denoiser: str = "transformer"
     # The prediction head.
     transformer: TransformerDenoiserConfig = field(default_factory=_default_head)
 

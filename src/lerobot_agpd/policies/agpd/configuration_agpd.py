@@ -8,7 +8,7 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import DiffuserSchedulerConfig
 from lerobot.policies.act.configuration_act import ACTConfig
 
-from lerobot_agpd.config import StudentConfig, require
+from lerobot_agpd.config import StudentConfig, require, require_at_least, require_scheduler
 
 
 @PreTrainedConfig.register_subclass("agpd")
@@ -32,6 +32,8 @@ class AGPDConfig(ACTConfig, StudentConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        require_scheduler(self.scheduler_name)
+        require_at_least(self, 0, "scheduler_warmup_steps")
         n_steps = self.collect.n_action_steps
         require(
             n_steps is None or n_steps <= self.chunk_size,

@@ -8,7 +8,7 @@ from lerobot.policies.act.processor_act import make_act_pre_post_processors
 from lerobot.processor import PolicyAction, PolicyProcessorPipeline
 
 from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig
-from lerobot_agpd.replay.normalization import Statistics, floor_statistics
+from lerobot_agpd.replay.normalization import Statistics, training_statistics
 
 
 def make_agpd_pre_post_processors(
@@ -18,5 +18,5 @@ def make_agpd_pre_post_processors(
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
     """LeRobot's ACT processors, with statistics that no constant feature can blow up."""
-    floored = floor_statistics(dataset_stats) if dataset_stats is not None else None
-    return make_act_pre_post_processors(config, floored)
+    statistics = training_statistics(config, dataset_stats) if dataset_stats is not None else None
+    return make_act_pre_post_processors(config, statistics)

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 
-from lerobot_agpd.config import require
+from lerobot_agpd.config import require, require_at_least, require_scheduler
 
 UNUSED_DOWN_DIMS = (16,)
 """Size of the U-Net that LeRobot's DiffusionModel always builds, where another denoiser replaces it."""
 
-# Named, not spelled out at the fields: the flag parser finds a field's comment only if its annotation is plain words.
-PredictionType = Literal["sample", "epsilon"]
-Denoiser = Literal["mlp", "transformer", "unet"]
+DENOISERS = ("mlp", "transformer", "unet")
+"""No Literal type: argparse would hold the flags of the same name of all other policy types to it."""
 
 
 @dataclass
@@ -65,6 +63,17 @@ class TransformerDenoiserConfig:
         )
 
 
+COUNTS = (
+    "n_obs_steps",
+    "horizon",
+    "n_action_steps",
+    "num_train_timesteps",
+    "num_inference_steps",
+    "noise_samples_per_frame",
+)
+"""Settings that are numbers of steps or samples."""
+
+
 @PreTrainedConfig.register_subclass("diffusion_transformer")
 @dataclass
 class DiffusionTransformerConfig(DiffusionConfig):
@@ -100,9 +109,9 @@ class DiffusionTransformerConfig(DiffusionConfig):
         }
     )
     # What the denoiser predicts: the clean chunk (sample), or the noise (epsilon).
-    prediction_type: PredictionType = "sample"
-    # Network that denoises.
-    denoiser: Denoiser = "mlp"
+    prediction_type: str = "sample"
+    # Network that denoises: mlp, transformer or unet.
+    denoiser: str = "mlp"
     mlp: MLPDenoiserConfig = field(default_factory=MLPDenoiserConfig)
     transformer: TransformerDenoiserConfig = field(default_factory=TransformerDenoiserConfig)
     # Average the weights (EMA, as in arXiv:2303.04137) and save the average as the policy's weights.
@@ -118,13 +127,20 @@ class DiffusionTransformerConfig(DiffusionConfig):
     optimizer_betas: tuple[float, float] = (0.9, 0.999)
 
     def __post_init__(self) -> None:
+        require(
+            self.denoiser in DENOISERS,
+            f"--policy.denoiser must be one of {', '.join(DENOISERS)}, got '{self.denoiser}'",
+        )
+        require(
+            self.prediction_type in ("sample", "epsilon"),
+            f"--policy.prediction_type must be sample or epsilon, got '{self.prediction_type}'",
+        )
         if not self.down_dims:
             self.down_dims = DiffusionConfig.down_dims if self.denoiser == "unet" else UNUSED_DOWN_DIMS
+        require_at_least(self, 1, *COUNTS)
+        require_at_least(self, 0, "drop_n_last_frames", "scheduler_warmup_steps")
+        require_scheduler(self.scheduler_name)
         super().__post_init__()
-        require(
-            self.noise_samples_per_frame >= 1,
-            f"--policy.noise_samples_per_frame must be at least 1, got {self.noise_samples_per_frame}",
-        )
         usable = self.horizon - self.n_obs_steps + 1
         require(
             self.n_action_steps <= usable,

@@ -10,7 +10,7 @@ from lerobot.processor import PolicyAction, PolicyProcessorPipeline
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
     DiffusionTransformerConfig,
 )
-from lerobot_agpd.replay.normalization import Statistics, floor_statistics
+from lerobot_agpd.replay.normalization import Statistics, training_statistics
 
 
 def make_diffusion_transformer_pre_post_processors(
@@ -20,5 +20,5 @@ def make_diffusion_transformer_pre_post_processors(
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
     """LeRobot's diffusion processors, with statistics whose spread has a lower limit."""
-    floored = floor_statistics(dataset_stats) if dataset_stats is not None else None
-    return make_diffusion_pre_post_processors(config, floored)
+    statistics = training_statistics(config, dataset_stats) if dataset_stats is not None else None
+    return make_diffusion_pre_post_processors(config, statistics)

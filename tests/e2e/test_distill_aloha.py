@@ -83,6 +83,7 @@ def test_distillation_from_cameras(aloha_demos: Path, tmp_path: Path) -> None:
         "--policy.collect.rounds=1",
         "--policy.collect.episodes=2",
         "--policy.collect.n_envs=2",
+        "--policy.collect.diagnostics=false",
         "--policy.adversary.start=1",
         "--steps=3",
         f"--output_dir={output}",

@@ -61,7 +61,7 @@ def test_merge_equals_what_the_journal_holds(journal, add, make_episode, demonst
 
 def test_merging_again_replaces(journal, add, make_episode):
     add(journal, 0, 0, make_episode(0))
-    (journal.root / "merged.partial").mkdir()  # an earlier attempt was killed
+    (journal.root / "merged.new").mkdir()  # an earlier attempt was killed
     assert len(merge(journal.root, "local/merged")) == 3
     add(journal, 0, 0, make_episode(1))
     assert len(merge(journal.root, "local/merged")) == 6
