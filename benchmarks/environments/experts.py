@@ -42,7 +42,8 @@ def play(config: EnvConfig, skill: float, n_seeds: int) -> dict:
     env, expert = config.make_single(), make_expert(config)
     episodes = []
     for seed in track(range(n_seeds), f"{config.task}, {config.episode_length} steps, skill {skill:g}"):
-        operator = Operator(expert, skill, np.random.default_rng([0, seed]))
+        rng = np.random.default_rng([0, seed])
+        operator = Operator(expert.for_episode(rng), skill, rng)
         episodes.append(play_episode(env, operator, seed, config.features_map))
     env.close()
     counted = [frames for frames in episodes if frames is not None]

@@ -17,6 +17,7 @@ logger = logging.getLogger(__name__)
 ENV_TYPES = {
     "aloha_state": "lerobot_agpd.envs.aloha",
     "gymnasium_robotics": "lerobot_agpd.envs.gymnasium_robotics",
+    "point_maze_ways": "lerobot_agpd.envs.point_maze",
     "robosuite_robomimic": "lerobot_agpd.envs.robomimic",
 }
 """`--env.type` to the module that registers it."""

@@ -15,16 +15,18 @@ from lerobot.envs.utils import check_env_attributes_and_types, env_to_policy_fea
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_agpd.config import FlagError
-from lerobot_agpd.envs import aloha, gymnasium_robotics, robomimic
+from lerobot_agpd.envs import aloha, gymnasium_robotics, point_maze, robomimic
 from lerobot_agpd.envs.aloha import AlohaStateEnvConfig
 from lerobot_agpd.envs.base import ENVIRONMENT_STATE
 from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
+from lerobot_agpd.envs.point_maze import PointMazeWaysEnv
 from lerobot_agpd.envs.robomimic import RobomimicEnvConfig
 
 KITCHEN = "FrankaKitchen-v1"
 MODULES = {
     AlohaStateEnvConfig: (aloha, "gym_aloha", "aloha"),
     GymnasiumRoboticsEnv: (gymnasium_robotics, "gymnasium_robotics", "fetch"),
+    PointMazeWaysEnv: (point_maze, "gymnasium_robotics", "fetch"),
     RobomimicEnvConfig: (robomimic, "robosuite", "robomimic"),
 }
 """Type to its module, the package of its simulation and the extra that installs it."""
@@ -33,6 +35,7 @@ QUICK = [
     (AlohaStateEnvConfig, "AlohaTransferCube-v0"),
     (AlohaStateEnvConfig, "AlohaInsertion-v0"),
     *((GymnasiumRoboticsEnv, task) for task in gymnasium_robotics.TASKS),
+    *((PointMazeWaysEnv, task) for task in point_maze.TASKS),
     (RobomimicEnvConfig, "lift"),
 ]
 SLOW = [(RobomimicEnvConfig, task) for task in robomimic.TASKS if task != "lift"]
@@ -74,7 +77,13 @@ def test_gymnasium_env_checker_accepts_pixels(rendering, kind):
 
 
 @pytest.mark.parametrize(
-    ("kind", "task"), [QUICK[0], QUICK[-1], *((GymnasiumRoboticsEnv, t) for t in ("FetchPush-v4", KITCHEN))]
+    ("kind", "task"),
+    [
+        QUICK[0],
+        QUICK[-1],
+        (PointMazeWaysEnv, "Chain-v0"),
+        *((GymnasiumRoboticsEnv, t) for t in ("FetchPush-v4", KITCHEN)),
+    ],
 )
 @pytest.mark.parametrize("use_async_envs", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_vector_env_agrees_with_the_declared_features(use_async_envs, kind, task):
@@ -119,6 +128,7 @@ def test_vector_env_agrees_with_the_declared_features(use_async_envs, kind, task
         (AlohaStateEnvConfig, ["task=AlohaInsertion-v0", "cameras=[angle]"], {"cameras": ["angle"], "fps": 50}),
         (GymnasiumRoboticsEnv, ["task=FetchPush-v4", "episode_length=7"], {"episode_length": 7, "fps": 25}),
         (GymnasiumRoboticsEnv, [f"task={KITCHEN}", "tasks_to_complete=[kettle]"], {"tasks_to_complete": ["kettle"]}),
+        (PointMazeWaysEnv, ["task=Chain-v0", "obs_type=pixels"], {"episode_length": 130, "fps": 10}),
         (RobomimicEnvConfig, ["task=tool_hang", "obs_type=pixels"], {"episode_length": 700, "fps": 20}),
         (RobomimicEnvConfig, ["cameras=[frontview]", "obs_type=pixels"], {"cameras": ["frontview"]}),
     ],
@@ -137,6 +147,7 @@ def test_command_line_and_round_trip(kind, options, expected):
         (AlohaStateEnvConfig(), 400, ["top"]),
         (GymnasiumRoboticsEnv(), 50, []),
         (GymnasiumRoboticsEnv(task=KITCHEN), 280, []),
+        (PointMazeWaysEnv(), 60, []),
         (RobomimicEnvConfig(), 400, ["agentview", "robot0_eye_in_hand"]),
         (
             RobomimicEnvConfig(task="transport"),

@@ -22,11 +22,13 @@ from scipy.stats import binomtest
 
 from lerobot_agpd.cli.command import entry_point
 from lerobot_agpd.cli.progress import episode_bar
-from lerobot_agpd.config import EVALUATION_SEEDS, require
+from lerobot_agpd.config import EVALUATION_SEEDS, FlagError, require
 from lerobot_agpd.dataset_writer import DatasetWriter, flag, image, vector
 from lerobot_agpd.envs.base import SimulatedEnvConfig
 from lerobot_agpd.envs.demonstrations import SKILL, DemosReport, successful_episodes
 from lerobot_agpd.envs.experts import make_expert
+from lerobot_agpd.envs.experts.base import Expert
+from lerobot_agpd.envs.experts.point_maze import WaysExpert
 
 logger = logging.getLogger(__name__)
 
@@ -52,6 +54,8 @@ class DemosConfig:
     seed: int = 0
     # 1 is the expert, 0 the worst operator; "[1,0.5]": two operators in turn.
     skill: float | list[float] = 1.0
+    # point_maze_ways only: fraction of the episodes on each way, e.g. "[0.25,0.25,0.5]"; default: all alike.
+    ways: list[float] | None = None
     # Upload the dataset when it is done.
     push_to_hub: bool = False
 
@@ -62,7 +66,7 @@ class DemosConfig:
             FlagError: if an option is impossible.
             ValueError: if the task has no expert.
         """
-        make_expert(self.env)
+        self.make_expert()
         require(
             bool(self.skills) and all(0 <= skill <= 1 for skill in self.skills),
             f"--skill={self.skill} must be one or several numbers in [0, 1]",
@@ -74,6 +78,20 @@ class DemosConfig:
             f"[0, {EVALUATION_SEEDS[0]}); evaluations use those from {EVALUATION_SEEDS[0]} on",
         )
         require(not self.root.exists(), f"--root={self.root} already exists; choose a new folder")
+
+    def make_expert(self) -> Expert | WaysExpert:
+        """Expert of the task, with the requested fractions of the ways.
+
+        Raises:
+            FlagError: if the task does not have these ways.
+            ValueError: if the task has no expert.
+        """
+        expert = make_expert(self.env)
+        if self.ways is None:
+            return expert
+        if not isinstance(expert, WaysExpert):
+            raise FlagError(f"--ways={self.ways}: the expert of --env.task={self.env.task} knows one way")
+        return expert.with_ways(self.ways)
 
     @property
     def skills(self) -> list[float]:
@@ -117,7 +135,7 @@ def record_demos(config: DemosConfig) -> DemosReport:
     env = config.env.make_single()
     episodes = successful_episodes(
         env,
-        make_expert(config.env),
+        config.make_expert(),
         config.env.features_map,
         config.skills,
         config.episodes,

@@ -10,6 +10,7 @@ from lerobot.utils.utils import flatten_dict
 
 from lerobot_agpd.dataset_writer import Frame
 from lerobot_agpd.envs.experts.base import Expert, Observation
+from lerobot_agpd.envs.experts.point_maze import WaysExpert
 from lerobot_agpd.envs.operators import Operator
 
 SKILL = "skill"
@@ -79,7 +80,7 @@ def play_episode(
 
 def successful_episodes(
     env: gym.Env,
-    expert: Expert,
+    expert: Expert | WaysExpert,
     features_map: dict[str, str],
     skills: Sequence[float],
     n_episodes: int,
@@ -105,7 +106,8 @@ def successful_episodes(
     """
     for seed in seeds:
         skill = skills[len(report.seeds) % len(skills)]
-        operator = Operator(expert, skill, np.random.default_rng([seeds[0], seed]))
+        rng = np.random.default_rng([seeds[0], seed])
+        operator = Operator(expert.for_episode(rng), skill, rng)
         frames = play_episode(env, operator, seed, features_map)
         if frames is None:
             report.solved_at_start_seeds.append(seed)

@@ -4,12 +4,14 @@ from collections.abc import Mapping
 
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_agpd.envs.experts import aloha, fetch, robomimic
+from lerobot_agpd.envs.experts import aloha, fetch, point_maze, robomimic
 from lerobot_agpd.envs.experts.base import Expert
+from lerobot_agpd.envs.experts.point_maze import WaysExpert
 
-EXPERTS: Mapping[str, Mapping[str, Expert]] = {
+EXPERTS: Mapping[str, Mapping[str, Expert | WaysExpert]] = {
     "gymnasium_robotics": fetch.EXPERTS,
     "aloha_state": aloha.EXPERTS,
+    "point_maze_ways": point_maze.EXPERTS,
     "robosuite_robomimic": robomimic.EXPERTS,
 }
 """Environment type (`--env.type`) and task (`--env.task`) to expert."""
@@ -21,7 +23,7 @@ IMPORT_COMMANDS = {
 """Environment type to the command that imports people's demonstrations."""
 
 
-def make_expert(env: EnvConfig) -> Expert:
+def make_expert(env: EnvConfig) -> Expert | WaysExpert:
     """Find the expert of an environment's task.
 
     Args:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +78,10 @@ class Expert:
     def intentions(self, observation: Observation) -> Array:
         """Intention of every hand, (H, 4)."""
         return np.atleast_2d(np.asarray(self.intend(observation), dtype=np.float64))
+
+    def for_episode(self, rng: np.random.Generator) -> Self:
+        """Expert of one episode: itself, since it has no memory and draws nothing."""
+        return self
 
     def __call__(self, observation: Observation) -> np.ndarray:
         """Action (A,), float32."""

@@ -1,0 +1,109 @@
+"""Scripted experts for the mazes of `envs.ways`: draw a way, then follow its waypoints.
+
+Which way an episode takes no observation shows at its start: the demonstrations know several.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from lerobot_agpd.config import require
+from lerobot_agpd.envs.base import AGENT_POS
+from lerobot_agpd.envs.experts.base import Array, Expert, Observation
+from lerobot_agpd.envs.ways import TASKS
+
+# Acceleration at an action of 1 of PointMaze's ball of 4.19 kg with a gear of 100, m/s^2.
+ACCELERATION = 23.9
+# Seconds in which the controller makes up for a difference in velocity.
+VELOCITY_TIME = 0.15
+# Distance at which the next waypoint takes over, meters.
+WAYPOINT_RADIUS = 0.4
+# Standard deviation of the force's noise, action units, and its correlation from one step to the next.
+NOISE = 0.02
+NOISE_CORRELATION = 0.8
+
+
+class WayFollower:
+    """Follows one way for one episode."""
+
+    def __init__(self, waypoints: Array, speed: float, rng: np.random.Generator) -> None:
+        """Begin an episode.
+
+        Args:
+            waypoints: (N, 2), meters.
+            speed: m/s.
+            rng: source of the noise.
+        """
+        self._waypoints = waypoints
+        self._speed = speed
+        self._rng = rng
+        self._next = 0
+        self._noise: Array = np.zeros(2)
+
+    def __call__(self, observation: Observation) -> Array:
+        """Intention (4,): force in x and y, and two zeros."""
+        state = np.asarray(observation[AGENT_POS], dtype=np.float64)
+        if state.shape != (4,):
+            raise ValueError(f"Expected {AGENT_POS} (4,) of a single environment, got {state.shape}.")
+        position, velocity = state[:2], state[2:]
+        last = len(self._waypoints) - 1
+        while self._next < last and self._distance(position) < WAYPOINT_RADIUS:
+            self._next += 1
+        heading = (self._waypoints[self._next] - position) / max(self._distance(position), 1e-6)
+        force = (self._speed * heading - velocity) / (VELOCITY_TIME * ACCELERATION)
+        return np.append(force + self._next_noise(), np.zeros(2))
+
+    def _distance(self, position: Array) -> float:
+        return float(np.linalg.norm(self._waypoints[self._next] - position))
+
+    def _next_noise(self) -> Array:
+        innovation = NOISE * np.sqrt(1.0 - NOISE_CORRELATION**2)
+        self._noise = NOISE_CORRELATION * self._noise + innovation * self._rng.standard_normal(2)
+        return self._noise
+
+
+def ball_position(observation: Observation) -> Array:
+    """Position (1, 3) of the ball, meters."""
+    return np.append(np.asarray(observation[AGENT_POS][:2], dtype=np.float64), 0.0)[None]
+
+
+def as_force(observation: Observation, intention: Array) -> np.ndarray:
+    """Action (2,), float32, of an intention (1, 4)."""
+    return np.clip(intention[0, :2], -1.0, 1.0).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class WaysExpert:
+    """Draws a way for every episode.
+
+    Attributes:
+        task: key of `ways.TASKS`.
+        fractions: probability of every way; None: all alike.
+    """
+
+    task: str
+    fractions: tuple[float, ...] | None = None
+
+    def with_ways(self, fractions: Sequence[float]) -> Self:
+        """The same expert with other probabilities of the ways.
+
+        Raises:
+            FlagError: if there is not one per way, or they do not sum to 1.
+        """
+        n_ways = TASKS[self.task].n_ways
+        require(
+            len(fractions) == n_ways and min(fractions) >= 0 and abs(sum(fractions) - 1) <= 1e-6,
+            f"--ways={list(fractions)} must be {n_ways} fractions that sum to 1, one for each way of {self.task}",
+        )
+        return replace(self, fractions=tuple(fractions))
+
+    def for_episode(self, rng: np.random.Generator) -> Expert:
+        """Draw a way and return the expert that follows it."""
+        task = TASKS[self.task]
+        way = int(rng.choice(task.n_ways, p=self.fractions))
+        return Expert(WayFollower(task.waypoints(way), task.speed, rng), ball_position, as_force)
+
+
+EXPERTS: dict[str, WaysExpert] = {name: WaysExpert(name) for name in TASKS}
