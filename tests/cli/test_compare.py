@@ -52,7 +52,8 @@ def test_jobs_run_their_commands_in_order_and_report_failures(tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_an_interrupt_ends_what_was_started(tmp_path, number):
     parent = f"""
-import sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background commands ignore it
 from pathlib import Path
 from rich.console import Console
 from lerobot_agpd.studies.jobs import Job, run_jobs
