@@ -103,7 +103,8 @@ def test_distillation_from_pixels(tmp_path: Path) -> None:
     rounds = tmp_path / "agpd"
     environment = {"type": "pusht", "task": "PushT-v0"}
     origin = {"environment": environment, "teacher": str(last_checkpoint(teacher)), "seed": 1000}
-    write_round(rounds, demos, {"strategy": "guided", **origin})
+    settings = {"guidance.at": "x0", "collect.min_reward": 0.9, "collect.keep_failures": False}
+    write_round(rounds, demos, {"strategy": "guided", **settings, **origin})
     printed = run(
         "lerobot-train",
         *TINY_STUDENT,
