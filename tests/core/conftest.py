@@ -5,8 +5,12 @@ from pathlib import Path
 import pytest
 import torch
 from lerobot.policies import make_pre_post_processors
+from point_environment import PointEnv, PointTeacher, demonstrate
+from small_dataset import create_dataset
+from toy_run import EPISODES, ROUND_STEPS, SCALE, STEPS, TEACHER_ONLY, Run
 
-from lerobot_agpd.config import AdversaryConfig, CollectConfig, TeacherConfig
+from lerobot_agpd import build as builders
+from lerobot_agpd.config import AdversaryConfig, CollectConfig, GuidanceConfig, TeacherConfig
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
     DiffusionTransformerConfig,
@@ -75,3 +79,56 @@ def loop_batch(demonstrations):
 
 NO_ROUNDS = CollectConfig(every=0)
 NO_ADVERSARY = AdversaryConfig(weight=0)
+
+
+# ---- runs with the toy teacher of point_environment ----
+
+
+@pytest.fixture(scope="module")
+def point_demonstrations(tmp_path_factory):
+    return demonstrate(create_dataset(tmp_path_factory.mktemp("data") / "point"), 3)
+
+
+@pytest.fixture
+def toy_teacher(monkeypatch):
+    """The teacher that every run loads."""
+    teacher = PointTeacher()
+    monkeypatch.setattr(builders, "load_teacher", lambda config, device: teacher)
+    return teacher
+
+
+@pytest.fixture
+def start(agpd_config, point_demonstrations, toy_teacher, tmp_path):
+    """Starts a run with the toy teacher, or continues one from its checkpoint; `facts` are those of the run."""
+
+    def start(checkpoint=None, collect=None, guidance=None, **facts) -> Run:
+        torch.manual_seed(0)
+        config = agpd_config(
+            teacher=TeacherConfig(path="a/toy"),
+            guidance=GuidanceConfig(**{"scale": SCALE, **(guidance or {})}),
+            adversary=AdversaryConfig(start=2),
+            collect=CollectConfig(
+                **{
+                    "warmup": ROUND_STEPS[0],
+                    "every": 3,
+                    "episodes": EPISODES,
+                    "n_envs": 3,
+                    "diagnostics": False,
+                    "teacher_only_fraction": TEACHER_ONLY / EPISODES,
+                    **(collect or {}),
+                }
+            ),
+        )
+        run = RunInfo(
+            **{"output_dir": tmp_path / "run", "env": PointEnv(), "steps": STEPS, **facts},
+            resume=checkpoint is not None,
+        )
+        meta = point_demonstrations.meta
+        options = {"dataset_stats": meta.stats, "dataset_meta": meta, "run": run}
+        if checkpoint is None:
+            return Run(AGPDPolicy(config, **options), point_demonstrations)
+        config.pretrained_path = checkpoint
+        policy = AGPDPolicy.from_pretrained(checkpoint, config=config, **options)
+        return Run(policy, point_demonstrations)
+
+    return start

@@ -1,4 +1,4 @@
-"""The alternation: warm-up, rounds, T grows, the scale adapts; then resumed, interrupted, finished."""
+"""The alternation: warm-up, rounds, T grows, the scale adapts; several processes, gradient accumulation."""
 
 from dataclasses import replace
 
@@ -6,125 +6,19 @@ import numpy as np
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.policies import make_pre_post_processors
-from point_environment import EPISODE_LENGTH, Point, PointEnv, PointTeacher, demonstrate
-from small_dataset import create_dataset
+from point_environment import EPISODE_LENGTH, PointEnv
+from toy_run import EPISODES, ROUND_STEPS, SCALE, STEPS, TEACHER_ONLY, episodes_on_disk
 
 from lerobot_agpd import agpd as algorithm, build as builders
 from lerobot_agpd.agpd import make_strategy
-from lerobot_agpd.config import AdversaryConfig, CollectConfig, GuidanceConfig, MixingConfig, TeacherConfig
+from lerobot_agpd.config import MixingConfig
 from lerobot_agpd.guidance.representation import StateRepresentation
-from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
 from lerobot_agpd.replay.export import MERGED
 from lerobot_agpd.replay.normalization import Normalizer
 from lerobot_agpd.replay.replay import FRAME_INDEX
 from lerobot_agpd.rollout.collector import Collector
 from lerobot_agpd.rollout.report import success_rate
-from lerobot_agpd.run import RunInfo
 from lerobot_agpd.student import StudentSampler
-
-STEPS, EPISODES, TEACHER_ONLY, SCALE = 10, 6, 2, 0.25
-ROUND_STEPS = [3, 6, 9]
-
-
-@pytest.fixture(scope="module")
-def point_demonstrations(tmp_path_factory):
-    return demonstrate(create_dataset(tmp_path_factory.mktemp("data") / "point"), 3)
-
-
-@pytest.fixture(autouse=True)
-def toy_teacher(monkeypatch):
-    """The teacher that every run loads."""
-    teacher = PointTeacher()
-    monkeypatch.setattr(builders, "load_teacher", lambda config, device: teacher)
-    return teacher
-
-
-class Run:
-    """A run of a few steps through the hooks that LeRobot's training loop calls."""
-
-    def __init__(self, policy: AGPDPolicy, dataset):
-        self.policy, self.dataset, self.logs = policy.train(), dataset, []
-        self.optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=1e-4)
-        self.processors = make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats)
-
-    @property
-    def agpd(self):
-        return self.policy.agpd
-
-    def batch(self):
-        frames = torch.utils.data.default_collate([self.dataset[n] for n in range(0, len(self.dataset), 2)])
-        return self.processors[0](frames)
-
-    def train(self, until: int) -> "Run":
-        """Train until so many steps are done."""
-        while self.agpd.progress.step < until:
-            self.policy.train()
-            for _ in range(self.agpd.run.steps_per_update):
-                loss, log = self.policy.forward(self.batch())
-                loss.backward()
-                self.logs.append({"loss": loss.item(), **log})
-            self.optimizer.step()
-            self.optimizer.zero_grad()
-            self.policy.update()
-        return self
-
-    def save(self) -> "Run":
-        """Save a checkpoint where LeRobot would."""
-        self.policy.save_pretrained(self.checkpoint)
-        for processor in self.processors:
-            processor.save_pretrained(self.checkpoint)
-        return self
-
-    @property
-    def checkpoint(self):
-        step = f"{self.agpd.progress.step:06d}"
-        return self.agpd.run.output_dir / "checkpoints" / step / "pretrained_model"
-
-    def records(self, round_number):
-        return self.agpd.journal.records(round_number)
-
-
-@pytest.fixture
-def start(agpd_config, point_demonstrations, tmp_path):
-    """Starts a run, or continues one from its checkpoint; `facts` are those of the run."""
-
-    def start(checkpoint=None, collect=None, guidance=None, **facts) -> Run:
-        torch.manual_seed(0)
-        config = agpd_config(
-            teacher=TeacherConfig(path="a/toy"),
-            guidance=GuidanceConfig(**{"scale": SCALE, **(guidance or {})}),
-            adversary=AdversaryConfig(start=2),
-            collect=CollectConfig(
-                **{
-                    "warmup": ROUND_STEPS[0],
-                    "every": 3,
-                    "episodes": EPISODES,
-                    "n_envs": 3,
-                    "diagnostics": False,
-                    "teacher_only_fraction": TEACHER_ONLY / EPISODES,
-                    **(collect or {}),
-                }
-            ),
-        )
-        run = RunInfo(
-            **{"output_dir": tmp_path / "run", "env": PointEnv(), "steps": STEPS, **facts},
-            resume=checkpoint is not None,
-        )
-        meta = point_demonstrations.meta
-        options = {"dataset_stats": meta.stats, "dataset_meta": meta, "run": run}
-        if checkpoint is None:
-            return Run(AGPDPolicy(config, **options), point_demonstrations)
-        config.pretrained_path = checkpoint
-        policy = AGPDPolicy.from_pretrained(checkpoint, config=config, **options)
-        return Run(policy, point_demonstrations)
-
-    return start
-
-
-def episodes_on_disk(agpd) -> dict[str, np.ndarray]:
-    return {str(path): np.load(path) for path in sorted(agpd.journal.root.rglob("*.npy"))}
-
 
 # ---- a whole run ----
 
@@ -262,74 +156,6 @@ def test_a_failed_upload_does_not_end_the_training(start, caplog):
     assert "--repo_id=nobody/nothing --push_to_hub=true" in caplog.text
 
 
-# ---- numbers that are not finite ----
-
-
-@pytest.fixture
-def break_environment(monkeypatch):
-    """Makes the environment deliver NaN in some of its episodes, counted from 0, from the second step on."""
-
-    def break_it(what, episodes):
-        counter, reset, step = iter(range(10**6)), Point.reset, Point.step
-
-        def counted_reset(self, **options):
-            self.broken = next(counter) in episodes
-            self.n_steps = 0
-            return reset(self, **options)
-
-        def broken_step(self, action):
-            observation, reward, *rest = step(self, action)
-            self.n_steps += 1
-            if self.broken and self.n_steps == 2:
-                if what == "reward":
-                    reward = float("nan")
-                else:
-                    observation[what] = np.full_like(observation[what], np.nan)
-            return observation, reward, *rest
-
-        monkeypatch.setattr(Point, "reset", counted_reset)
-        monkeypatch.setattr(Point, "step", broken_step)
-
-    return break_it
-
-
-BROKEN = {
-    "agent_pos": "'observation.state' at step 2",
-    "environment_state": "'observation.environment_state' at step 2",
-    "reward": "'next.reward' at step 1",
-}
-
-
-@pytest.mark.parametrize("what", BROKEN)
-def test_one_nan_from_the_environment_costs_its_episode_and_no_more(start, break_environment, caplog, what):
-    """It is not kept although it succeeds, is counted, and the run goes on, also when resumed."""
-    break_environment(what, episodes={1})
-    run = start().train(until=4).save()
-    (report,) = run.agpd.reports
-    (record,) = [record for record in run.records(0) if record.invalid]
-    assert record.invalid == BROKEN[what] and not record.kept and not record.success
-    assert report.total.invalid == 1 and report.total.generated == EPISODES and report.total.kept > 0
-    (warning,) = [r.getMessage() for r in caplog.records if "not finite" in r.getMessage()]
-    assert BROKEN[what] in warning and "1 of 6" in warning
-    assert all(np.isfinite(columns).all() for columns in run.agpd.replay.table.columns.values())
-    assert np.isfinite(run.logs[-1]["loss"])
-    assert all(torch.isfinite(value).all() for value in run.policy.state_dict().values())
-    resumed = start(run.checkpoint)
-    assert resumed.agpd.reports == run.agpd.reports
-    assert resumed.train(until=7).agpd.reports[1].total.invalid == 0
-
-
-@pytest.mark.parametrize("what", BROKEN)
-def test_a_round_of_mostly_invalid_episodes_stops_the_run(start, break_environment, what):
-    break_environment(what, episodes=set(range(100)) - {1})
-    run = start().train(until=2).save()
-    with pytest.raises(
-        FloatingPointError, match=rf"of 6 episodes.*{BROKEN[what]}.*--env.*round-00000.*--resume"
-    ):
-        run.train(until=3)
-    assert run.agpd.journal.reports() == []
-
-
 # ---- several processes ----
 
 
@@ -374,73 +200,3 @@ def test_rounds_are_counted_in_lerobots_steps(start):
 def test_a_run_of_unknown_length_is_never_at_its_end(start):
     run = start(steps=None).train(until=4)
     assert not run.agpd.after_update() and not (run.agpd.journal.root / MERGED).exists()
-
-
-# ---- resume ----
-
-
-def test_a_resumed_run_goes_on_where_its_checkpoint_was(start, tmp_path):
-    first = start().train(until=4).save()
-    resumed = start(first.checkpoint)
-    assert resumed.agpd.progress.step == 4 and len(resumed.agpd.reports) == 1
-    assert resumed.agpd.replay.n_collected_frames == first.agpd.replay.n_collected_frames
-    assert resumed.agpd.scale == first.agpd.scale != SCALE
-    assert resumed.agpd.progress.seen_episodes == [0, 1, 2]
-    resumed.train(until=5), first.train(until=5)
-    assert torch.equal(*(run.agpd.train_batch(run.batch())[FRAME_INDEX] for run in (first, resumed)))
-    resumed.train(until=9)
-    assert [report.step for report in resumed.agpd.reports] == ROUND_STEPS
-
-
-def test_rounds_after_the_checkpoint_are_adopted_and_not_collected_twice(start):
-    first = start().train(until=4).save()
-    checkpoint = first.checkpoint
-    first.train(until=7)
-    collected = episodes_on_disk(first.agpd)
-    resumed = start(checkpoint)
-    assert resumed.agpd.progress.step == 4 and resumed.agpd.progress.rounds == 2
-    resumed.train(until=7)
-    assert len(resumed.agpd.reports) == 2 and episodes_on_disk(resumed.agpd).keys() == collected.keys()
-    resumed.train(until=9)
-    assert len(resumed.agpd.reports) == 3
-
-
-def test_a_run_that_was_moved_finds_its_episodes(start, tmp_path):
-    first = start().train(until=4).save()
-    (tmp_path / "run").rename(tmp_path / "moved")
-    moved = tmp_path / "moved" / first.checkpoint.relative_to(tmp_path / "run")
-    resumed = start(moved)
-    assert resumed.agpd.journal.root == tmp_path / "moved" / "agpd" and len(resumed.agpd.reports) == 1
-
-
-@pytest.mark.parametrize("strategy", ["guided", "rollin"])
-def test_an_interrupted_round_is_continued(start, monkeypatch, strategy):
-    run = start(collect={"strategy": strategy}).train(until=2).save()
-    calls, classify = [], algorithm.classify
-
-    def dying(episode, config):
-        calls.append(episode.spec)
-        if len(calls) == 4:
-            raise KeyboardInterrupt
-        return classify(episode, config)
-
-    monkeypatch.setattr(algorithm, "classify", dying)
-    with pytest.raises(KeyboardInterrupt):
-        run.train(until=3)
-    before = {record.number: record for record in run.records(0)}
-    frames = episodes_on_disk(run.agpd)
-    assert len(before) == 3 and run.agpd.journal.reports() == []
-
-    checkpoint = run.agpd.run.output_dir / "checkpoints" / "000002" / "pretrained_model"
-    resumed = start(checkpoint, collect={"strategy": strategy}).train(until=3)
-    records = resumed.records(0)
-    assert [record.number for record in records] == list(range(EPISODES))
-    assert {number: repr(records[number]) for number in before} == {n: repr(r) for n, r in before.items()}
-    after = episodes_on_disk(resumed.agpd)
-    assert all(after[path].tobytes() == values.tobytes() for path, values in frames.items())
-    assert len(calls) == 4 + EPISODES - 3, "no finished episode is rolled out again"
-    specs = resumed.agpd.collector.specs(0, SCALE)
-    assert [(r.seed, r.strength) for r in records] == [(spec.seed, spec.strength) for spec in specs]
-    assert resumed.agpd.reports[0].total.generated == EPISODES
-    n_frames = resumed.agpd.replay.n_collected_frames
-    assert n_frames == sum(record.length for record in records if record.kept)
