@@ -107,6 +107,7 @@ class DistilledPolicy(Student):
         losses = agpd.losses(batch, reference, prior, self.discriminator)
         log = {"imitation_loss": loss.item(), **(log or {}), **losses.log}
         self._require_finite_losses(log, batch)
+        # Where gradients are accumulated, those of the micro-batch before: the next pop shall hold one backward pass.
         self._last_norms = self._gradient_norms.pop() or self._last_norms
         return loss + losses.total, {**log, **self._last_norms}
 
