@@ -139,7 +139,7 @@ TASKS: dict[str, WaysTask] = {
         ),
         choices=((((0.0, 1.1), (0.0, 6.5)), ((-2.0, -2.1), (-2.0, -6.5)), ((2.0, -2.1), (2.0, -6.5))),),
         environment_state_dim=6,
-        episode_length=60,
+        episode_length=80,
         speed=2.5,
     ),
     "Chain-v0": WaysTask(
