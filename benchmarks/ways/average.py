@@ -16,9 +16,10 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_agpd.envs.base import AGENT_POS
-from lerobot_agpd.envs.experts.point_maze import WaysExpert
+from lerobot_agpd.envs.experts.point_maze import EXPERTS
+from lerobot_agpd.envs.experts.ways import WaysExpert
+from lerobot_agpd.envs.maze_tasks import TASKS
 from lerobot_agpd.envs.point_maze import PointMazeWaysEnv
-from lerobot_agpd.envs.ways import TASKS
 
 RESULT = Path(__file__).parent / "average.json"
 CHUNK, EXECUTED = 16, 8
@@ -77,7 +78,9 @@ def train(states: Tensor, chunks: Tensor, loss: nn.Module) -> nn.Module:
 def run(task: str, loss: str, fractions: tuple[float, ...] | None, n_demonstrations: int) -> dict:
     """Train and evaluate one student."""
     env, spec = PointMazeWaysEnv(task=task).make_single(), TASKS[task]
-    episodes = [demonstrate(env, WaysExpert(task, fractions), seed) for seed in range(n_demonstrations)]
+    way_of = lambda states: spec.way_of(states, states[:, :0])  # noqa: E731  positions suffice
+    expert = EXPERTS[task] if fractions is None else EXPERTS[task].with_ways(fractions)
+    episodes = [demonstrate(env, expert, seed) for seed in range(n_demonstrations)]
     states = torch.tensor(np.concatenate([states for states, _ in episodes]))
     chunks = torch.tensor(np.concatenate([chunks for _, chunks in episodes])).flatten(1)
     mean, std = (states.mean(0), chunks.mean(0)), (states.std(0), chunks.std(0))
@@ -100,14 +103,14 @@ def run(task: str, loss: str, fractions: tuple[float, ...] | None, n_demonstrati
         successes.append(info["is_success"])
         ends.append([round(float(x), 1) for x in observation[AGENT_POS][:2]])
         if info["is_success"]:
-            ways.append(spec.way_of(np.array(path)))
+            ways.append(way_of(np.array(path)))
     return {
         "task": task,
         "loss": loss,
         "fractions": fractions,
         "demonstrations": n_demonstrations,
         "demonstrated": np.bincount(
-            [spec.way_of(states) for states, _ in episodes], minlength=spec.n_ways
+            [way_of(states) for states, _ in episodes], minlength=spec.n_ways
         ).tolist(),
         "success": float(np.mean(successes)),
         "taken": np.bincount(np.array(ways, dtype=int), minlength=spec.n_ways).tolist(),

@@ -6,10 +6,10 @@ import pytest
 from lerobot_agpd.cli.demos import DemosConfig
 from lerobot_agpd.config import FlagError
 from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS
-from lerobot_agpd.envs.experts.point_maze import EXPERTS, WaysExpert
+from lerobot_agpd.envs.experts.point_maze import EXPERTS
 from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
+from lerobot_agpd.envs.maze_tasks import TASKS
 from lerobot_agpd.envs.point_maze import PointMazeWaysEnv
-from lerobot_agpd.envs.ways import TASKS
 
 pytest.importorskip("gymnasium_robotics")
 
@@ -30,12 +30,14 @@ def test_every_way_is_taken_and_read_off_the_states(task):
     env = PointMazeWaysEnv(task=task).make_single()
     n_ways = TASKS[task].n_ways
     for way in range(n_ways):
-        expert = WaysExpert(task, tuple(np.eye(n_ways)[way]))
+        expert = EXPERTS[task].with_ways(np.eye(n_ways)[way])
         for seed in range(3):
             states, success = play(env, expert.for_episode(np.random.default_rng(seed)), seed)
-            assert success and TASKS[task].way_of(states) == way
+            assert success and TASKS[task].way_of(states, states[:, :0]) == way
             assert 20 <= len(states) <= 0.75 * TASKS[task].episode_length
-            assert TASKS[task].way_of(states[:-1]) == way  # as recorded: without the state at the exit
+            assert (
+                TASKS[task].way_of(states[:-1], states[:-1, :0]) == way
+            )  # as recorded: without the state at the exit
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -28,7 +28,7 @@ from lerobot_agpd.envs.base import SimulatedEnvConfig
 from lerobot_agpd.envs.demonstrations import SKILL, DemosReport, successful_episodes
 from lerobot_agpd.envs.experts import make_expert
 from lerobot_agpd.envs.experts.base import Expert
-from lerobot_agpd.envs.experts.point_maze import WaysExpert
+from lerobot_agpd.envs.experts.ways import WaysExpert
 
 logger = logging.getLogger(__name__)
 
@@ -54,7 +54,7 @@ class DemosConfig:
     seed: int = 0
     # 1 is the expert, 0 the worst operator; "[1,0.5]": two operators in turn.
     skill: float | list[float] = 1.0
-    # point_maze_ways only: fraction of the episodes on each way, e.g. "[0.25,0.25,0.5]"; default: all alike.
+    # Tasks with several ways only: fraction of the episodes on each way, e.g. "[0.25,0.25,0.5]"; default: all alike.
     ways: list[float] | None = None
     # Upload the dataset when it is done.
     push_to_hub: bool = False

@@ -10,7 +10,7 @@ from lerobot.utils.utils import flatten_dict
 
 from lerobot_agpd.dataset_writer import Frame
 from lerobot_agpd.envs.experts.base import Expert, Observation
-from lerobot_agpd.envs.experts.point_maze import WaysExpert
+from lerobot_agpd.envs.experts.ways import WaysExpert
 from lerobot_agpd.envs.operators import Operator
 
 SKILL = "skill"

@@ -1,6 +1,6 @@
 """LeRobot environment type `point_maze_ways`: PointMaze of Gymnasium-Robotics with maps that allow several ways.
 
-The tasks are in `ways`, the simulation in `point_maze_sim`.
+The tasks are in `maze_tasks`, the simulation in `point_maze_sim`.
 """
 
 from dataclasses import dataclass
@@ -9,8 +9,8 @@ import gymnasium as gym
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_agpd.envs.base import SimulatedEnvConfig
+from lerobot_agpd.envs.maze_tasks import TASKS
 from lerobot_agpd.envs.packages import require_packages
-from lerobot_agpd.envs.ways import TASKS
 
 
 @EnvConfig.register_subclass("point_maze_ways")

@@ -12,8 +12,8 @@ from gymnasium_robotics.envs.maze.maze_v4 import Maze
 from gymnasium_robotics.envs.maze.point import PointEnv
 
 from lerobot_agpd.envs.base import View
+from lerobot_agpd.envs.maze_tasks import FPS, TASKS, WALL, MazeTask
 from lerobot_agpd.envs.rendering import ViewedEnv
-from lerobot_agpd.envs.ways import FPS, TASKS, WALL, WaysTask
 
 WALL_HEIGHT = 0.4  # meters, PointMaze's
 GOAL_RADIUS = 0.45  # meters, PointMaze's
@@ -22,7 +22,7 @@ FRAME_SKIP = 10
 assert FRAME_SKIP * FPS == 100  # PointMaze's steps per second
 
 
-def build_point(task: WaysTask) -> PointEnv:
+def build_point(task: MazeTask) -> PointEnv:
     """Build PointMaze's ball between the walls of a task, every exit marked."""
     cells: list[list[int | str]] = [[1 if cell == WALL else 0 for cell in row] for row in task.maze]
     ball = Path(mujoco_assets()) / "point.xml"
@@ -52,7 +52,7 @@ def mujoco_assets() -> str:
 
 
 class PointMazeWays(ViewedEnv):
-    """One task of `ways.TASKS` with LeRobot's raw keys.
+    """One task of `maze_tasks.TASKS` with LeRobot's raw keys.
 
     `agent_pos` (4,) is the ball's position and velocity, `environment_state` the vectors from the ball to all exits.
     An action is a force in PointMaze's units. Reaching any exit ends the episode with `info["is_success"]`.
@@ -62,7 +62,7 @@ class PointMazeWays(ViewedEnv):
     render_mode = "rgb_array"
 
     def __init__(self, task: str, view: View) -> None:
-        """Build the simulation of a key of `ways.TASKS`; no graphics context is opened before the first image."""
+        """Build the simulation of a key of `maze_tasks.TASKS`; no graphics context is opened before the first image."""
         self.task, self.spec_of_task = task, TASKS[task]
         self.set_view(view, self.spec_of_task)
         self.point = build_point(self.spec_of_task)

@@ -6,7 +6,7 @@ from lerobot.envs.configs import EnvConfig
 
 from lerobot_agpd.envs.experts import aloha, fetch, point_maze, robomimic
 from lerobot_agpd.envs.experts.base import Expert
-from lerobot_agpd.envs.experts.point_maze import WaysExpert
+from lerobot_agpd.envs.experts.ways import WaysExpert
 
 EXPERTS: Mapping[str, Mapping[str, Expert | WaysExpert]] = {
     "gymnasium_robotics": fetch.EXPERTS,

@@ -1,18 +1,16 @@
-"""Scripted experts for the mazes of `envs.ways`: draw a way, then follow its waypoints.
+"""Scripted experts for the mazes of `envs.maze_tasks`: draw a way, then follow its waypoints.
 
 Which way an episode takes no observation shows at its start: the demonstrations know several.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Self
+from functools import partial
 
 import numpy as np
 
-from lerobot_agpd.config import require
 from lerobot_agpd.envs.base import AGENT_POS
 from lerobot_agpd.envs.experts.base import Array, Expert, Observation
-from lerobot_agpd.envs.ways import TASKS
+from lerobot_agpd.envs.experts.ways import WaysExpert
+from lerobot_agpd.envs.maze_tasks import TASKS
 
 # Acceleration at an action of 1 of PointMaze's ball of 4.19 kg with a gear of 100, m/s^2.
 ACCELERATION = 23.9
@@ -74,36 +72,12 @@ def as_force(observation: Observation, intention: Array) -> np.ndarray:
     return np.clip(intention[0, :2], -1.0, 1.0).astype(np.float32)
 
 
-@dataclass(frozen=True)
-class WaysExpert:
-    """Draws a way for every episode.
-
-    Attributes:
-        task: key of `ways.TASKS`.
-        fractions: probability of every way; None: all alike.
-    """
-
-    task: str
-    fractions: tuple[float, ...] | None = None
-
-    def with_ways(self, fractions: Sequence[float]) -> Self:
-        """The same expert with other probabilities of the ways.
-
-        Raises:
-            FlagError: if there is not one per way, or they do not sum to 1.
-        """
-        n_ways = TASKS[self.task].n_ways
-        require(
-            len(fractions) == n_ways and min(fractions) >= 0 and abs(sum(fractions) - 1) <= 1e-6,
-            f"--ways={list(fractions)} must be {n_ways} fractions that sum to 1, one for each way of {self.task}",
-        )
-        return replace(self, fractions=tuple(fractions))
-
-    def for_episode(self, rng: np.random.Generator) -> Expert:
-        """Draw a way and return the expert that follows it."""
-        task = TASKS[self.task]
-        way = int(rng.choice(task.n_ways, p=self.fractions))
-        return Expert(WayFollower(task.waypoints(way), task.speed, rng), ball_position, as_force)
+def follow(task: str, way: int, rng: np.random.Generator) -> Expert:
+    """Expert that takes a way of a key of `maze_tasks.TASKS` for one episode."""
+    spec = TASKS[task]
+    return Expert(WayFollower(spec.waypoints(way), spec.speed, rng), ball_position, as_force)
 
 
-EXPERTS: dict[str, WaysExpert] = {name: WaysExpert(name) for name in TASKS}
+EXPERTS: dict[str, WaysExpert] = {
+    name: WaysExpert(name, spec.n_ways, partial(follow, name)) for name, spec in TASKS.items()
+}
