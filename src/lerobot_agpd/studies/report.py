@@ -16,6 +16,7 @@ from lerobot_agpd.studies.tables import (
     markdown,
     results_table,
     summary_table,
+    ways_table,
 )
 
 SAME = ("packages", "teacher", "demonstrations")
@@ -51,6 +52,11 @@ chunks, root mean square in the teacher's units, with teacher and strategy sampl
 standard deviation of the teacher's own samples at one observation (older rounds lack it); the KL divergence is that of
 moment-matched Gaussians over single actions (Eq. 14), in nats, the median over observations. Entropy (nearest neighbors,
 nats) and held-out coverage (P_S) are those of kept states, in standard deviations of the demonstrations.
+"""
+
+WAYS_NOTE = """\
+Kept episodes on every way, per training seed and round, and in brackets their entropy over the ways in nats: 0 if all took
+the same.
 """
 
 
@@ -109,6 +115,12 @@ def _task(matrix: Matrix, task: str, methods: Methods, pictures: str) -> list[st
     parts += ["### What it took", markdown(cost_table(methods))]
     if rows := collection_table(methods):
         parts += ["### What the rounds did", markdown(rows)]
+    if rows := ways_table(methods):
+        parts += [
+            "### Which way the kept episodes took",
+            WAYS_NOTE.replace("\n", " ").rstrip(),
+            markdown(rows),
+        ]
     return parts
 
 

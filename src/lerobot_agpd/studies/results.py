@@ -13,6 +13,7 @@ from lerobot_agpd.studies.evaluation import Evaluation
 from lerobot_agpd.studies.latency import Latency
 from lerobot_agpd.studies.runs import Run
 from lerobot_agpd.studies.statistics import Difference, Estimate, mean, paired_difference, success_rate
+from lerobot_agpd.studies.ways import RoundWays
 
 CHECKPOINTS = ("best", "last")
 
@@ -60,6 +61,7 @@ class RunResult(Result):
         rounds_adopted: rounds that an interrupted run's student met earlier than an uninterrupted one's.
         made_with: kind (code, packages, teacher, demonstrations) to what it was made with, normally one of each.
         weights: digest of the weights of a policy that was only evaluated.
+        ways: in a task with several, which way the kept episodes of every round took.
     """
 
     run: Run
@@ -68,6 +70,7 @@ class RunResult(Result):
     rounds_adopted: int
     made_with: Mapping[str, frozenset[str]]
     weights: str | None = None
+    ways: Sequence[RoundWays] = ()
 
 
 Methods = Mapping[str, Sequence[RunResult]]

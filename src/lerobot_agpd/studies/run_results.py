@@ -22,6 +22,7 @@ from lerobot_agpd.studies.provenance import digest, provenance
 from lerobot_agpd.studies.results import CHECKPOINTS, RunResult
 from lerobot_agpd.studies.runs import Run, expand
 from lerobot_agpd.studies.training import is_trained, read_starts, replay_folder, train_command
+from lerobot_agpd.studies.ways import read_ways, ways_of_rounds
 
 logger = logging.getLogger(__name__)
 
@@ -45,6 +46,7 @@ def evaluate_run(matrix: Matrix, run: Run) -> None:
         **_requested(matrix, run),
         **measured,
         "rounds": [report.to_json() for report in rounds],
+        "ways": [entry.to_json() for entry in ways_of_rounds(replay_folder(run), env_config)],
         "seconds": _seconds(run, rounds),
         "starts": read_starts(run),
         "evaluated_with": provenance(),
@@ -143,6 +145,7 @@ def _result(run: Run, matrix: Matrix, content: Mapping[str, Any]) -> RunResult:
         finals={which: _evaluation(content[which]) for which in CHECKPOINTS},
         latency=Latency(**content["latency"]),
         rounds=[RoundReport.from_json(entry) for entry in content["rounds"]],
+        ways=read_ways(content.get("ways", [])),
         seconds=content["seconds"],
         rounds_adopted=sum(start["rounds_adopted"] for start in content["starts"]),
         made_with=_made_with(run, matrix, content),

@@ -207,6 +207,20 @@ def _mean(values: Sequence[float | None], digits: str) -> str:
     return digits.format(np.mean(present)) if present else "-"
 
 
+def ways_table(methods: Methods) -> list[Row]:
+    """Which way the kept episodes took: a row per method and training seed; empty in a task with one way."""
+    runs = {
+        f"{name}, {result.run.seed}": result.ways for name, results in methods.items() for result in results
+    }
+    longest = max((len(ways) for ways in runs.values()), default=0)
+    rows: list[Row] = [("", *(f"round {number}" for number in range(longest)))]
+    for name, ways in runs.items():
+        cells = [f"{' '.join(map(str, round_.total))} ({round_.entropy:.2f})" for round_ in ways]
+        if cells:
+            rows.append((name, *cells, *[""] * (longest - len(cells))))
+    return rows if longest else []
+
+
 def rounds_table(rounds: Sequence[RoundReport]) -> list[Row]:
     """One row per collection round of a run."""
     rows: list[Row] = [
