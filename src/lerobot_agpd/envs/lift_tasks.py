@@ -25,6 +25,9 @@ CONTROLLER: dict[str, Any] = {
 }
 """The arm's controller: robomimic's, and faster. Actions are those of `robomimic_tasks.ARM_ACTION_DIM`."""
 
+POSTURE = (0.0, 0.48756, 0.0, -2.17213, 0.0, 2.65969, 0.785398)
+"""Joints (radians) at the start: the hand points down from 18 cm above the table's center."""
+
 TABLE_HEIGHT = 0.8  # meters
 HALF_CUBE = 0.02  # meters
 LIFTED = 0.04
@@ -54,18 +57,12 @@ class LiftTask(WaysTask):
         return int(environment_state[-1].reshape(-1, 3)[:, 2].argmax())
 
 
-CENTER = (-0.10, 0.0)
-
-def _around(*offsets: tuple[float, float]) -> tuple[tuple[float, float], ...]:
-    return tuple((CENTER[0] + x, CENTER[1] + y) for x, y in offsets)
-
-
 TASKS: dict[str, LiftTask] = {
     "LiftAny-v0": LiftTask(
         description="Lift any cube.",
-        cubes=_around((0.12, 0.0), (-0.06, 0.104), (-0.06, -0.104)),
+        cubes=((0.12, 0.0), (-0.06, 0.104), (-0.06, -0.104)),
         environment_state_dim=9,
-        episode_length=50,
+        episode_length=40,
     ),
 }
 """`--env.task` to task."""

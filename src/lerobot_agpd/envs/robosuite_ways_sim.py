@@ -12,7 +12,18 @@ import mujoco
 import numpy as np
 
 from lerobot_agpd.envs.base import View
-from lerobot_agpd.envs.lift_tasks import CONTROLLER, FPS, HALF_CUBE, LIFTED, ROBOT, TABLE_HEIGHT, TASKS, LiftTask
+from lerobot_agpd.envs.lift_tasks import (
+    CONTROLLER,
+    FPS,
+    HALF_CUBE,
+    LIFTED,
+    POSTURE,
+    ROBOT,
+    TABLE_HEIGHT,
+    TASKS,
+    LiftTask,
+)
+from lerobot_agpd.envs.operational_space import OperationalSpace
 from lerobot_agpd.envs.rendering import ViewedEnv
 from lerobot_agpd.envs.robosuite_sim import COLLISION_GROUP, MODEL_SEED, numpy_seeded
 
@@ -60,6 +71,7 @@ class CubesOnTable(ManipulationEnv):
     def _load_model(self) -> None:
         super()._load_model()
         (robot,) = self.robots
+        robot.init_qpos = np.array(POSTURE)
         size = (0.8, 0.8, 0.05)
         robot.robot_model.set_base_xpos(robot.robot_model.base_xpos_offset["table"](size[0]))
         arena = TableArena(size, table_offset=(0.0, 0.0, TABLE_HEIGHT))
@@ -76,20 +88,26 @@ class CubesOnTable(ManipulationEnv):
 
     def _reset_internal(self) -> None:
         super()._reset_internal()
+        (robot,) = self.robots
+        self._operational_space = OperationalSpace(robot.part_controllers["right"], self.sim.model._model)
+        self._arm, self._gripper = (
+            robot._ref_actuators_indexes_dict[part] for part in ("right", "right_gripper")
+        )
+        self._torque_limits = self.sim.model.actuator_ctrlrange[self._arm].T
         for cube, place in zip(self.cubes, self.task.cubes, strict=True):
             x, y = place + np.random.uniform(-PLACE_NOISE, PLACE_NOISE, 2)
             self.sim.data.set_joint_qpos(cube.joints[0], [x, y, TABLE_HEIGHT + HALF_CUBE, 1, 0, 0, 0])
 
     def _pre_action(self, action: np.ndarray, policy_step: bool = False) -> None:
-        """Let the controller act, as `FixedBaseRobot.control` does but without its records of the past."""
+        """Let the controllers act as `FixedBaseRobot.control` does, without its records of the past."""
         (robot,), sim = self.robots, self.sim
-        robot.composite_controller.update_state()
         if policy_step:
+            robot.part_controllers["right"].new_update = True
             robot.composite_controller.set_goal(action)
-        for part, command in robot.composite_controller.run_controller(robot._enabled_parts).items():
-            actuators = robot._ref_actuators_indexes_dict[part]
-            low, high = sim.model.actuator_ctrlrange[actuators].T
-            sim.data.ctrl[actuators] = np.clip(command, low, high)
+            sim.data.ctrl[self._gripper] = robot.part_controllers["right_gripper"].run_controller()
+        sim.data.ctrl[self._arm] = np.clip(
+            self._operational_space.torques(sim.data._data), *self._torque_limits
+        )
 
     def _setup_observables(self) -> dict[str, Any]:
         """None: `LiftWays` reads the simulation itself."""
@@ -135,7 +153,9 @@ class LiftWays(ViewedEnv):
     def _read(self) -> dict[str, Any]:
         (robot,), data = self.simulation.robots, self.simulation.sim.data
         hand = np.array(data.site_xpos[robot.eef_site_id["right"]])
-        w, x, y, z = data.body_xquat[self.simulation.sim.model.body_name2id(robot.robot_model.eef_name["right"])]
+        w, x, y, z = data.body_xquat[
+            self.simulation.sim.model.body_name2id(robot.robot_model.eef_name["right"])
+        ]
         fingers = data.qpos[robot._ref_gripper_joint_pos_indexes["right"]]
         vectors = self.simulation.cube_positions - hand
         return self.observe(np.concatenate([hand, [x, y, z, w], fingers]), vectors.ravel())
@@ -161,7 +181,12 @@ class LiftWays(ViewedEnv):
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """One control step of 50 ms; the reward is 1 if a cube is lifted and 0 otherwise."""
         self.simulation.step(np.asarray(action, dtype=np.float64))
-        self.simulation.sim.forward()
+        model, data = self.scene()
+        mujoco.mj_kinematics(
+            model, data
+        )  # robosuite leaves the positions at those before its last step of physics
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_camlight(model, data)
         success = self.is_success
         return self._read(), float(success), success, False, {"is_success": success}
 

@@ -9,17 +9,19 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lerobot_agpd.envs.base import AGENT_POS
-from lerobot_agpd.envs.experts.base import Array, Expert, Observation, descend, ramp, state_vectors
+from lerobot_agpd.envs.experts.base import Array, Expert, Observation, ramp, state_vectors
 from lerobot_agpd.envs.experts.robomimic import CLOSE, OPEN, ROTATION_GAIN
 from lerobot_agpd.envs.experts.ways import WaysExpert
 from lerobot_agpd.envs.lift_tasks import TASKS
 
 # Action units per meter of position error.
-POSITION_GAIN = 30.0
+POSITION_GAIN = np.array([20.0, 20.0, 15.0])
 # Largest action downward.
 DESCENT = 0.6
 # Height of the hand above the cube's center before it comes down to grasp, unless it is above the cube, meters.
 CLEARANCE = 0.09
+# Weights of an offset in x, y and z when the fingers close: along x they are as wide as the cube.
+ALONG_FINGERS = np.array([0.5, 1.0, 1.0])
 # Standard deviation of the displacement's noise, action units, and its correlation from one step to the next.
 NOISE = 0.04
 NOISE_CORRELATION = 0.8
@@ -41,12 +43,16 @@ class CubeLifter:
 
     def __call__(self, observation: Observation) -> Array:
         """Intention (4,): displacement and gripper."""
-        agent, vectors = state_vectors(observation, self._spec.agent_pos_dim, self._spec.environment_state_dim)
+        agent, vectors = state_vectors(
+            observation, self._spec.agent_pos_dim, self._spec.environment_state_dim
+        )
         to_cube, width = vectors.reshape(-1, 3)[self._cube], float(agent[7] - agent[8])
-        between_fingers = ramp(float(np.linalg.norm(to_cube)), zero_at=0.03, one_at=0.015)
+        offset = ALONG_FINGERS * to_cube
+        between_fingers = ramp(float(np.linalg.norm(offset)), zero_at=0.03, one_at=0.018)
         held = between_fingers * ramp(width, zero_at=0.055, one_at=0.048)
-        fingers_shut = (1.0 - between_fingers) * ramp(width, zero_at=0.03, one_at=0.02)
-        approach = POSITION_GAIN * descend(to_cube, CLEARANCE, fingers_shut)
+        beside = ramp(float(np.linalg.norm(offset[:2])), zero_at=0.015, one_at=0.05)
+        height = CLEARANCE * max(beside, (1.0 - between_fingers) * ramp(width, zero_at=0.03, one_at=0.02))
+        approach = POSITION_GAIN * (to_cube + [0.0, 0.0, height])
         approach[2] = max(approach[2], -DESCENT)
         displacement = (1.0 - held) * np.clip(approach, -1.0, 1.0) + held * np.array([0.0, 0.0, 1.0])
         return np.append(displacement + self._next_noise(), OPEN + (CLOSE - OPEN) * between_fingers)
