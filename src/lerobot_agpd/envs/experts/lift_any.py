@@ -15,7 +15,7 @@ from lerobot_agpd.envs.experts.ways import WaysExpert
 from lerobot_agpd.envs.lift_tasks import TASKS
 
 # Action units per meter of position error.
-POSITION_GAIN = np.array([20.0, 20.0, 15.0])
+POSITION_GAIN = np.array([25.0, 25.0, 15.0])
 # Largest action downward.
 DESCENT = 0.6
 # Height of the hand above the cube's center before it comes down to grasp, unless it is above the cube, meters.
