@@ -7,6 +7,7 @@ usage: python benchmarks/ways/lift_any.py      (about 20 s of a busy core per ro
 """
 
 import json
+import time
 from pathlib import Path
 
 import gymnasium as gym
@@ -32,8 +33,8 @@ SETTINGS = [
 """Task, loss, fractions of the ways (None: all alike), demonstrations."""
 
 
-def demonstrate(env: gym.Env, expert: WaysExpert, seed: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """States (T, 18) of one episode and the chunks (T, CHUNK, 7) that follow, the last action repeated; None: failed."""
+def demonstrate(env: gym.Env, expert: WaysExpert, seed: int) -> tuple[np.ndarray, np.ndarray, bool]:
+    """States (T, 18) of one episode, the chunks (T, CHUNK, 7) that follow, the last action repeated, and its success."""
     follower = expert.for_episode(np.random.default_rng([7, seed]))
     env.reset(seed=seed)
     states, actions, done = [], [], False
@@ -45,7 +46,7 @@ def demonstrate(env: gym.Env, expert: WaysExpert, seed: int) -> tuple[np.ndarray
         done = terminated or truncated
     padded = np.array(actions + actions[-1:] * CHUNK)
     chunks = np.stack([padded[i : i + CHUNK] for i in range(len(actions))])
-    return (np.array(states), chunks) if info["is_success"] else None
+    return np.array(states), chunks, info["is_success"]
 
 
 def play(env: gym.Env, predict, seed: int) -> tuple[np.ndarray, bool]:
@@ -71,8 +72,10 @@ def run(task: str, loss: str, fractions: tuple[float, ...] | None, n_demonstrati
     robot = spec.agent_pos_dim
     way_of = lambda states: spec.way_of(states[:, :robot], states[:, robot:])  # noqa: E731
     expert = EXPERTS[task] if fractions is None else EXPERTS[task].with_ways(fractions)
+    begin = time.process_time()
     attempts = [demonstrate(env, expert, seed) for seed in range(n_demonstrations)]
-    episodes = [episode for episode in attempts if episode is not None]
+    seconds = time.process_time() - begin
+    episodes = [(states, chunks) for states, chunks, success in attempts if success]
     states = torch.tensor(np.concatenate([states for states, _ in episodes]))
     chunks = torch.tensor(np.concatenate([chunks for _, chunks in episodes])).flatten(1)
     mean, std = (states.mean(0), chunks.mean(0)), (states.std(0), chunks.std(0))
@@ -93,6 +96,7 @@ def run(task: str, loss: str, fractions: tuple[float, ...] | None, n_demonstrati
         "demonstrations": n_demonstrations,
         "failed_demonstrations": n_demonstrations - len(episodes),
         "steps_per_demonstration": len(states) / len(episodes),
+        "steps_per_second": sum(len(states) for states, _, _ in attempts) / seconds,
         "demonstrated": np.bincount(
             [way_of(states) for states, _ in episodes], minlength=spec.n_ways
         ).tolist(),

@@ -133,7 +133,7 @@ def test_vector_env_agrees_with_the_declared_features(use_async_envs, kind, task
         (GymnasiumRoboticsEnv, [f"task={KITCHEN}", "tasks_to_complete=[kettle]"], {"tasks_to_complete": ["kettle"]}),
         (PointMazeWaysEnv, ["task=Chain-v0", "obs_type=pixels"], {"episode_length": 130, "fps": 10}),
         (RobomimicEnvConfig, ["task=tool_hang", "obs_type=pixels"], {"episode_length": 700, "fps": 20}),
-        (RobosuiteWaysEnv, ["episode_length=40", "obs_type=pixels"], {"episode_length": 40, "fps": 20}),
+        (RobosuiteWaysEnv, ["episode_length=30", "obs_type=pixels"], {"episode_length": 30, "fps": 20}),
         (RobomimicEnvConfig, ["cameras=[frontview]", "obs_type=pixels"], {"cameras": ["frontview"]}),
     ],
 )  # fmt: skip
@@ -152,7 +152,7 @@ def test_command_line_and_round_trip(kind, options, expected):
         (GymnasiumRoboticsEnv(), 50, []),
         (GymnasiumRoboticsEnv(task=KITCHEN), 280, []),
         (PointMazeWaysEnv(), 80, []),
-        (RobosuiteWaysEnv(), 50, []),
+        (RobosuiteWaysEnv(), 40, []),
         (RobomimicEnvConfig(), 400, ["agentview", "robot0_eye_in_hand"]),
         (
             RobomimicEnvConfig(task="transport"),

@@ -6,10 +6,8 @@ A Panda stands before cubes on a table and lifts any of them. Nothing here needs
 from dataclasses import dataclass
 from typing import Any
 
-from lerobot_agpd.envs.robomimic_tasks import ARM_ACTION_DIM, ARM_CONTROLLER, ROBOT
+from lerobot_agpd.envs.robomimic_tasks import ARM_ACTION_DIM, ARM_CONTROLLER
 from lerobot_agpd.envs.ways import Array, WaysTask
-
-__all__ = ["CONTROLLER", "ROBOT", "TASKS", "LiftTask"]
 
 FPS = 20
 """Control steps per second."""

@@ -1,6 +1,7 @@
 """The simulation of `robosuite_ways`: a Panda of robosuite before cubes, of which it may lift any.
 
-Faster than robosuite's own Lift: no sensors, and steps of the physics of 5 ms instead of 2.
+Faster than robosuite's own Lift: no sensors, steps of the physics of 5 ms instead of 2, and the torques of
+`operational_space`.
 """
 
 from collections.abc import Iterator
@@ -18,20 +19,22 @@ from lerobot_agpd.envs.lift_tasks import (
     HALF_CUBE,
     LIFTED,
     POSTURE,
-    ROBOT,
     TABLE_HEIGHT,
     TASKS,
     LiftTask,
 )
 from lerobot_agpd.envs.operational_space import OperationalSpace
 from lerobot_agpd.envs.rendering import ViewedEnv
+from lerobot_agpd.envs.robomimic_tasks import ROBOT
 from lerobot_agpd.envs.robosuite_sim import COLLISION_GROUP, MODEL_SEED, numpy_seeded
 
-from robosuite import macros  # isort: skip  our module above silences its warnings
-from robosuite.environments.manipulation.manipulation_env import ManipulationEnv  # isort: skip
-from robosuite.models.arenas import TableArena  # isort: skip
-from robosuite.models.objects import BoxObject  # isort: skip
-from robosuite.models.tasks import ManipulationTask  # isort: skip
+# isort: split
+# robosuite comes last: `robosuite_sim` silences the warnings of its import.
+from robosuite import macros
+from robosuite.environments.manipulation.manipulation_env import ManipulationEnv
+from robosuite.models.arenas import TableArena
+from robosuite.models.objects import BoxObject
+from robosuite.models.tasks import ManipulationTask
 
 TIMESTEP = 0.005  # of the physics, seconds
 PLACE_NOISE = 0.01  # meters in x and y, at most
