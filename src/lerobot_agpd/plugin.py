@@ -19,6 +19,7 @@ ENV_TYPES = {
     "gymnasium_robotics": "lerobot_agpd.envs.gymnasium_robotics",
     "point_maze_ways": "lerobot_agpd.envs.point_maze",
     "robosuite_robomimic": "lerobot_agpd.envs.robomimic",
+    "robosuite_ways": "lerobot_agpd.envs.robosuite_ways",
 }
 """`--env.type` to the module that registers it."""
 

@@ -15,12 +15,13 @@ from lerobot.envs.utils import check_env_attributes_and_types, env_to_policy_fea
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_agpd.config import FlagError
-from lerobot_agpd.envs import aloha, gymnasium_robotics, point_maze, robomimic
+from lerobot_agpd.envs import aloha, gymnasium_robotics, point_maze, robomimic, robosuite_ways
 from lerobot_agpd.envs.aloha import AlohaStateEnvConfig
 from lerobot_agpd.envs.base import ENVIRONMENT_STATE
 from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
 from lerobot_agpd.envs.point_maze import PointMazeWaysEnv
 from lerobot_agpd.envs.robomimic import RobomimicEnvConfig
+from lerobot_agpd.envs.robosuite_ways import RobosuiteWaysEnv
 
 KITCHEN = "FrankaKitchen-v1"
 MODULES = {
@@ -28,6 +29,7 @@ MODULES = {
     GymnasiumRoboticsEnv: (gymnasium_robotics, "gymnasium_robotics", "fetch"),
     PointMazeWaysEnv: (point_maze, "gymnasium_robotics", "fetch"),
     RobomimicEnvConfig: (robomimic, "robosuite", "robomimic"),
+    RobosuiteWaysEnv: (robosuite_ways, "robosuite", "robomimic"),
 }
 """Type to its module, the package of its simulation and the extra that installs it."""
 
@@ -36,6 +38,7 @@ QUICK = [
     (AlohaStateEnvConfig, "AlohaInsertion-v0"),
     *((GymnasiumRoboticsEnv, task) for task in gymnasium_robotics.TASKS),
     *((PointMazeWaysEnv, task) for task in point_maze.TASKS),
+    (RobosuiteWaysEnv, "LiftAny-v0"),
     (RobomimicEnvConfig, "lift"),
 ]
 SLOW = [(RobomimicEnvConfig, task) for task in robomimic.TASKS if task != "lift"]
@@ -130,6 +133,7 @@ def test_vector_env_agrees_with_the_declared_features(use_async_envs, kind, task
         (GymnasiumRoboticsEnv, [f"task={KITCHEN}", "tasks_to_complete=[kettle]"], {"tasks_to_complete": ["kettle"]}),
         (PointMazeWaysEnv, ["task=Chain-v0", "obs_type=pixels"], {"episode_length": 130, "fps": 10}),
         (RobomimicEnvConfig, ["task=tool_hang", "obs_type=pixels"], {"episode_length": 700, "fps": 20}),
+        (RobosuiteWaysEnv, ["episode_length=30", "obs_type=pixels"], {"episode_length": 30, "fps": 20}),
         (RobomimicEnvConfig, ["cameras=[frontview]", "obs_type=pixels"], {"cameras": ["frontview"]}),
     ],
 )  # fmt: skip
@@ -147,7 +151,8 @@ def test_command_line_and_round_trip(kind, options, expected):
         (AlohaStateEnvConfig(), 400, ["top"]),
         (GymnasiumRoboticsEnv(), 50, []),
         (GymnasiumRoboticsEnv(task=KITCHEN), 280, []),
-        (PointMazeWaysEnv(), 60, []),
+        (PointMazeWaysEnv(), 80, []),
+        (RobosuiteWaysEnv(), 40, []),
         (RobomimicEnvConfig(), 400, ["agentview", "robot0_eye_in_hand"]),
         (
             RobomimicEnvConfig(task="transport"),

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_agpd.envs.experts import aloha, fetch, point_maze, robomimic
+from lerobot_agpd.envs.experts import aloha, fetch, lift_any, point_maze, robomimic
 from lerobot_agpd.envs.experts.base import Expert
 from lerobot_agpd.envs.experts.ways import WaysExpert
 
@@ -13,6 +13,7 @@ EXPERTS: Mapping[str, Mapping[str, Expert | WaysExpert]] = {
     "aloha_state": aloha.EXPERTS,
     "point_maze_ways": point_maze.EXPERTS,
     "robosuite_robomimic": robomimic.EXPERTS,
+    "robosuite_ways": lift_any.EXPERTS,
 }
 """Environment type (`--env.type`) and task (`--env.task`) to expert."""
 
