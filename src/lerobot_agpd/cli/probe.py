@@ -1,8 +1,9 @@
 """`lerobot-agpd-probe`: is this teacher one that guidance can help with? A verdict, a picture and JSON."""
 
 import logging
+from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,9 @@ from lerobot_agpd.loading import (
     require_student,
 )
 from lerobot_agpd.studies.evaluation import Evaluator
-from lerobot_agpd.studies.probe import RecordedStates, TeacherProbe
+from lerobot_agpd.studies.probe import TeacherProbe
 from lerobot_agpd.studies.probe_picture import draw_probe
+from lerobot_agpd.studies.probe_states import RecordedStates
 from lerobot_agpd.studies.probe_verdict import Verdict, conclude, fewer_steps
 from lerobot_agpd.studies.probe_ways import LEAST_MEMBERS
 from lerobot_agpd.studies.provenance import provenance
@@ -148,14 +150,14 @@ def make_probe(config: ProbeConfig) -> TeacherProbe:
     return TeacherProbe(teacher, states, config.samples, config.seed, student)
 
 
-def success_by_steps(config: ProbeConfig, counts: list[int]) -> list[dict[str, Any]]:
-    """The teacher's success with each number of denoising steps, with Wilson's interval."""
+def success_by_steps(config: ProbeConfig, counts: Sequence[int | None]) -> list[dict[str, Any]]:
+    """The teacher's success with each number of denoising steps (None: the only way), with Wilson's interval."""
     if config.env is None:
         return []
     rows = []
     n_envs = min(config.batch_size, config.episodes)
     with closing(Evaluator(config.env, n_envs, config.output, config.device)) as evaluator:
-        for steps in counts or [None]:  # type: ignore[list-item]
+        for steps in counts:
             sampler = TeacherConfig(num_inference_steps=steps, noise_scheduler=config.teacher.noise_scheduler)
             path, seed = config.teacher.path, config.env_seed
             evaluation = evaluator.evaluate(path, config.episodes, seed, sampler=sampler)
@@ -175,13 +177,13 @@ def probe_teacher(config: ProbeConfig) -> tuple[dict[str, Any], Verdict]:
     evidence = probe.evidence(probe.pulls())
     verdict = conclude(evidence)
     latency = [{"steps": steps, "milliseconds": time} for steps, time in probe.latency()]
-    success = success_by_steps(config, probe.step_counts())
+    success = success_by_steps(config, [row["steps"] for row in latency])
     if len(success) > 1:
         rows = [
             (row["steps"], row["mean"], timed["milliseconds"])
             for row, timed in zip(success, latency, strict=True)
         ]
-        verdict.reasons.append(fewer_steps(rows))
+        verdict = replace(verdict, reasons=[*verdict.reasons, fewer_steps(rows)])
     content = {
         "teacher": {**asdict(config.teacher), "type": probe.teacher.policy.config.type},
         "student": None if config.policy is None else str(config.policy.pretrained_path),

@@ -1,6 +1,6 @@
 """Probe a teacher: its samples at recorded states, how far they can be pulled, and what a chunk costs.
 
-states      starts of episodes, and frames anywhere in them
+states      starts of episodes, and frames anywhere in them      probe_states.py
 samples     K chunks of the teacher at each                    probe_ways.py counts the ways among them
 pull        guidance and `nearest` toward a target chunk       the student's, or one more sample of the teacher
 cost        milliseconds and success by denoising steps
@@ -9,15 +9,13 @@ conclude    what it means, and the flags to type               probe_verdict.py
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 import torch
-from lerobot.configs import FeatureType
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
 from lerobot_agpd.agpd import GuidedStrategy
@@ -25,13 +23,11 @@ from lerobot_agpd.config import GuidanceConfig
 from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.guidance.teacher_student import TeacherStudent
 from lerobot_agpd.replay.episode import Array
-from lerobot_agpd.replay.frames import FrameTable
-from lerobot_agpd.replay.gate import require_finite_frames
-from lerobot_agpd.replay.images import RecordedFrames
 from lerobot_agpd.rollout.diagnostics import sample_spread
 from lerobot_agpd.rollout.strategies import NearestStrategy, Strategy, TeacherStrategy, repeat
 from lerobot_agpd.student import StudentSampler, executed_steps
 from lerobot_agpd.studies.latency import call_times
+from lerobot_agpd.studies.probe_states import RecordedStates
 from lerobot_agpd.studies.probe_verdict import (
     GUIDANCE_STRENGTHS,
     NEAREST_SAMPLES,
@@ -50,72 +46,6 @@ PULLED = 4
 
 TIMED = 20
 """Chunks whose time is taken."""
-
-
-# ---- states ----
-
-
-class RecordedStates:
-    """States of a dataset at which a teacher is asked: starts of episodes first, then frames anywhere in them.
-
-    Args:
-        dataset: the demonstrations; all their frames or selected episodes.
-        teacher: who observes them.
-        student: who observes them too, or None.
-        n_states: number of frames anywhere, and the largest number of starts.
-        seed: of the choice.
-
-    Attributes:
-        index: (S,) frame numbers.
-        is_start: (S,) whether a state is of the first group.
-    """
-
-    def __init__(
-        self,
-        dataset: LeRobotDataset,
-        teacher: Teacher,
-        student: StudentSampler | None,
-        n_states: int,
-        seed: int,
-    ):
-        features = dict(teacher.input_features)
-        self.n_obs_steps = teacher.n_obs_steps
-        if student is not None:
-            features |= student.config.input_features or {}
-            self.n_obs_steps = max(self.n_obs_steps, student.config.history_length or 1)
-        self.keys = list(features)
-        self.has_cameras = any(feature.type is FeatureType.VISUAL for feature in features.values())
-        vectors = [key for key, feature in features.items() if feature.type is not FeatureType.VISUAL]
-        table = FrameTable.from_dataset(dataset, vectors)
-        require_finite_frames(table, dataset.repo_id)
-        self._frames = RecordedFrames(dataset, table)
-        self._table = table
-        starts = torch.cat([torch.zeros(1, dtype=torch.long), table.lengths.cumsum(0)[:-1]])
-        noise = torch.Generator().manual_seed(seed)
-        chosen = starts[torch.randperm(len(starts), generator=noise)[:n_states].sort().values]
-        anywhere = torch.randperm(len(table), generator=noise)[:n_states]
-        self.index = torch.cat([chosen, anywhere])
-        self.is_start = torch.arange(len(self.index)) < len(chosen)
-
-    def __len__(self) -> int:
-        """Number of states S."""
-        return len(self.index)
-
-    def history(self, states: Tensor) -> dict[str, Any]:
-        """Raw observations (B, n_obs_steps, ...) of states (B,), counted from 0, and their tasks."""
-        return self._frames.history(self.index[states], self.keys, self.n_obs_steps)
-
-    def whereabouts(self) -> list[dict[str, int]]:
-        """Episode and frame within it of every state."""
-        first, _ = self._table.episode_bounds(self.index)
-        episodes, frames = self._table.episode(self.index), self.index - first
-        return [
-            {"episode": episode, "frame": frame}
-            for episode, frame in zip(episodes.tolist(), frames.tolist(), strict=True)
-        ]
-
-
-# ---- what the teacher does there ----
 
 
 @dataclass(frozen=True)
@@ -232,7 +162,7 @@ class TeacherProbe:
             return GuidedStrategy(pair, noise, GuidanceConfig(at=at))
         return NearestStrategy(pair, noise) if name == "nearest" else TeacherStrategy(pair, noise)
 
-    def _average(self, pulled: Tensor, measure: Any) -> float | None:
+    def _average(self, pulled: Tensor, measure: Callable[[Ways, Array, Array], Array]) -> float | None:
         """A measure's mean over the chunks at states with several ways."""
         values = [
             measure(ways, chunks.flatten(1).numpy(), target.flatten()[None].numpy())
@@ -264,8 +194,7 @@ class TeacherProbe:
         try:
             for steps in counts:
                 self.teacher.set_sampler(steps, None)
-                noise = self._noise(2)
-                times = call_times(lambda noise=noise: self.teacher.sample(history, generator=noise), TIMED)  # type: ignore[misc]
+                times = call_times(partial(self.teacher.sample, history, generator=self._noise(2)), TIMED)
                 rows.append((steps, float(np.median(times))))
         finally:
             self.teacher.set_sampler(own, None)

@@ -106,7 +106,7 @@ class Verdict:
     """
 
     finding: Finding
-    reasons: list[str]
+    reasons: Sequence[str]
     flags: str
 
 
@@ -182,14 +182,17 @@ def fewer_steps(success: Sequence[tuple[int, float, float]]) -> str:
     Args:
         success: steps, success rate and milliseconds per chunk, by steps; the last row has all steps.
     """
-    steps, rate, milliseconds = success[-1]
-    few = next(row for row in success if row[1] >= rate - AS_GOOD)
-    everything = f"{steps} steps succeed in {rate:.0%} at {milliseconds:.1f} ms per chunk"
-    if few[0] == steps:
-        return f"Fewer steps do not replace a student: the teacher's {everything}, all fewer numbers in less."
+    all_steps, rate, milliseconds = success[-1]
+    steps, fewer_rate, fewer_milliseconds = next(row for row in success if row[1] >= rate - AS_GOOD)
+    if steps == all_steps:
+        return (
+            f"Fewer denoising steps do not replace a student: the teacher succeeds in {rate:.0%} with {steps} steps "
+            f"({milliseconds:.1f} ms per chunk), in less with fewer."
+        )
     return (
-        f"The teacher with {_steps(few[0])} succeeds in {few[1]:.0%} at {few[2]:.1f} ms per chunk; its {everything}. "
-        "Is that fast enough without a student?"
+        f"The teacher succeeds in {fewer_rate:.0%} with {steps} denoising step{'s' * (steps != 1)} "
+        f"({fewer_milliseconds:.1f} ms per chunk), in {rate:.0%} with {all_steps} ({milliseconds:.1f} ms): it may be fast "
+        "enough without a student."
     )
 
 
@@ -209,7 +212,3 @@ def _name(pull: Pull) -> str:
     if pull.strategy == "nearest":
         return f"The nearest of {pull.strength:.0f} samples"
     return f"Guidance at scale {pull.strength:g}"
-
-
-def _steps(number: int) -> str:
-    return f"{number} denoising step{'s' * (number != 1)}"
