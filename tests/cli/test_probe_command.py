@@ -4,7 +4,10 @@ import json
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_agpd.cli import probe
 
@@ -46,6 +49,24 @@ def test_the_quickstart_s_teacher_has_one_way(monkeypatch, tmp_path, capsys):
     assert all(row["milliseconds"] > 0 for row in content["latency"])
     assert len(content["states"]) == 6 and all(sum(row["weights"]) <= 1 for row in content["states"])
     assert (tmp_path / "probe/probe.png").stat().st_size > 10_000
+
+
+def test_the_target_is_a_student_s_chunk_and_its_teacher_is_found(monkeypatch, student, teacher, tmp_path):
+    rng, shapes = np.random.default_rng(0), {OBS_STATE: (2,), OBS_ENV_STATE: (16,), ACTION: (2,)}
+    features = {key: {"dtype": "float32", "shape": shape, "names": None} for key, shape in shapes.items()}
+    root = tmp_path / "data"
+    dataset = LeRobotDataset.create("local/pusht", fps=10, features=features, root=root, use_videos=False)
+    for _ in range(6):
+        frame = {key: rng.uniform(0, 512, shape).astype(np.float32) for key, shape in shapes.items()}
+        dataset.add_frame({**frame, "task": "push"})
+    dataset.save_episode()
+    dataset.finalize()
+    data = {"dataset.repo_id": "local/pusht", "dataset.root": root, "teacher.path": None}
+    call(monkeypatch, tmp_path / "probe", **data, **{"policy.path": student})
+    content = json.loads((tmp_path / "probe/probe.json").read_text())
+    assert content["student"] == str(student) and content["teacher"]["path"] == str(teacher)
+    moved = [pull["moved"] for pull in content["evidence"]["pulls"]]
+    assert moved[0] == 0 < moved[1] < moved[2], "a stronger pull ends nearer to the student"
 
 
 @pytest.mark.slow

@@ -59,9 +59,11 @@ def test_several_ways_whose_median_is_one():
     [
         ((20, 20), (0, 64), "several ways"),  # the beginning alone decides
         ((0, 20), (10, 64), "several ways"),  # chosen on the way
-        ((1, 20), (1, 64), "one way"),  # no more than chance: 1 of 64 happens in 47 % of the probes
-        ((0, 20), (4, 64), "several ways"),  # 4 of 64 by chance: 0.4 %
-        ((0, 20), (3, 64), "one way"),  # 3 of 64: 2.7 %
+        ((1, 20), (1, 64), "one way"),  # by chance: at least 1 of 64 in 73 % of the probes
+        ((0, 20), (4, 64), "one way"),  # 3.9 %
+        ((0, 20), (5, 64), "several ways"),  # 0.9 %
+        ((2, 20), (0, 64), "one way"),  # 6.0 %
+        ((3, 20), (0, 64), "several ways"),  # 0.7 %
     ],
 )
 def test_how_many_states_count(starts, states, finding):

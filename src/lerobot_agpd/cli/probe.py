@@ -106,8 +106,9 @@ class ProbeConfig:
         if path:
             self.policy = read_policy_config(path, "--policy.path")
         if self.policy is not None:
-            self.policy.device = self.device
-            self.teacher.path = self.teacher.path or require_student(self.policy).teacher.path
+            student = require_student(self.policy)
+            student.device = self.device
+            self.teacher.path = self.teacher.path or student.teacher.path
         require(
             bool(self.teacher.path), "--teacher.path is not set: name a checkpoint folder or a Hub repository"
         )

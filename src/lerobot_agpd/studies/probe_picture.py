@@ -65,9 +65,9 @@ def _draw_samples(axis: Axes, probe: TeacherProbe, state: int, row: Mapping[str,
     half = max(LEAST_DISTANCE, *(abs(bound) for bound in (*axis.get_xlim(), *axis.get_ylim())))
     where = "start" if row["is_start"] else f"frame {row['frame']}"
     title = f"episode {row['episode']}, {where}: {len(ways)} way{'s' * (len(ways) != 1)}"
-    axis.set(title=title, xlim=(-half, half), ylim=(-half, half), aspect="equal")
+    axis.set(title=title, xlim=(-half, half), ylim=(-half, 1.3 * half), aspect="equal")
     axis.set(xlabel="first principal direction (rms)", ylabel="second")
-    axis.legend(fontsize=7)
+    axis.legend(fontsize=7, loc="upper center", ncols=3)
 
 
 def _principal_plane(samples: Array) -> Any:
@@ -100,8 +100,8 @@ def _draw_pulls(axis: Axes, pulls: list[dict[str, Any]]) -> None:
         if None not in values:
             axis.bar(places + 0.27 * (number - 1), values, 0.25, label=label)
     axis.set_xticks(places, names, rotation=30, ha="right")
-    axis.set(ylabel="fraction", ylim=(min(0.0, *(pull["moved"] for pull in pulls)), 1.05))
-    axis.legend(fontsize=8)
+    axis.set(ylabel="fraction", ylim=(min(0.0, *(pull["moved"] for pull in pulls)), 1.2))
+    axis.legend(fontsize=8, loc="upper center", ncols=len(keys))
 
 
 def _draw_cost(axis: Axes, content: Mapping[str, Any]) -> None:

@@ -17,7 +17,7 @@ GUIDANCE_STRENGTHS = (0.5, 2.0, 8.0)
 NEAREST_SAMPLES = (4, 16)
 """Numbers of samples that `nearest` is tried with."""
 
-FALSE_ALARMS = 0.01
+FALSE_ALARMS = 0.02
 """Several ways are found in a group of states if more than this fraction has them: that much is chance (docs/probe.md)."""
 
 COPES = 0.9
