@@ -91,7 +91,7 @@ def test_success_by_denoising_steps(monkeypatch, tmp_path):
         ({"dataset.root": "nowhere"}, "--dataset.root=nowhere is not the folder"),
         ({"dataset.repo_id": "no/such_dataset", "dataset.root": None}, "--dataset.repo_id=no/such_dataset"),
         ({"states": 0}, "--states must be at least 1"),
-        ({"samples": 10}, "--samples must be at least 20"),
+        ({"samples": 10}, "--samples must be at least 24"),
         ({"episodes": 1}, "--episodes must be at least 2"),
         ({"batch_size": 0}, "--batch_size must be at least 1"),
         ({"env_seed": 5}, "--env_seed=5"),

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tiny_policies import ACT, CAMERA, DIFFUSION, STATE, STATE_ONLY, WITH_CAMERA, make_policy, make_teacher
 
@@ -12,6 +13,8 @@ from lerobot_agpd.studies.probe_states import RecordedStates
 from lerobot_agpd.studies.probe_verdict import conclude
 
 LENGTHS = (6, 3, 9, 4, 5)
+ENV = "observation.environment_state"
+WITH_ENV = {**STATE_ONLY, ENV: PolicyFeature(FeatureType.ENV, (3,))}  # ACT needs it, or a camera
 
 
 class CoinTeacher(ChunkTeacher):
@@ -28,7 +31,7 @@ class CoinTeacher(ChunkTeacher):
 def record(root, inputs=STATE_ONLY) -> LeRobotDataset:
     """Random episodes; the first state entry is the step."""
     rng = np.random.default_rng(0)
-    shapes = {STATE: (3,), "action": (2,)}
+    shapes = {STATE: (3,), ENV: (3,), "action": (2,)}
     features = {key: {"dtype": "float32", "shape": shape, "names": None} for key, shape in shapes.items()}
     if CAMERA in inputs:
         names = ["height", "width", "channels"]
@@ -55,7 +58,7 @@ def recorded(tmp_path_factory) -> LeRobotDataset:
 
 @pytest.fixture
 def coin() -> CoinTeacher:
-    return CoinTeacher(*make_policy("act", STATE_ONLY, **ACT))
+    return CoinTeacher(*make_policy("act", WITH_ENV, **ACT))
 
 
 def make_probe(teacher, dataset, n_states=12, n_samples=64, seed=0) -> TeacherProbe:
@@ -98,21 +101,31 @@ def test_the_nearest_of_more_samples_is_more_often_on_the_target_s_way(recorded,
     assert verdict.finding == "several ways, median a way" and "strategy=nearest" in verdict.flags
 
 
+def test_a_teacher_that_predicts_in_one_pass_is_deterministic(recorded):
+    teacher = make_teacher("act", WITH_ENV, **ACT)
+    probe = make_probe(teacher, recorded, n_states=4, n_samples=24)
+    pulls = probe.pulls()
+    assert [pull.strategy for pull in pulls] == ["teacher", "nearest", "nearest"]
+    assert all(pull.moved == 0 and pull.chooses is None for pull in pulls)
+    assert conclude(probe.evidence(pulls)).finding == "deterministic"
+    assert [steps for steps, _ in probe.latency()] == [None]
+
+
 def test_a_probe_is_reproducible_and_leaves_the_teacher_as_it_was(recorded):
-    teacher = make_teacher("diffusion", STATE_ONLY, **DIFFUSION, num_inference_steps=6)
-    first, second = (make_probe(teacher, recorded, n_states=2, n_samples=20) for _ in range(2))
+    teacher = make_teacher("diffusion", WITH_ENV, **DIFFUSION, num_inference_steps=6)
+    first, second = (make_probe(teacher, recorded, n_states=2, n_samples=24) for _ in range(2))
     assert torch.equal(first.samples, second.samples) and first.pulls() == second.pulls()
     assert first.step_counts() == [1, 2, 4, 6]
     assert [steps for steps, _ in first.latency()] == [1, 2, 4, 6]
     assert teacher.n_denoising_steps == 6
-    assert torch.equal(make_probe(teacher, recorded, n_states=2, n_samples=20).samples, first.samples)
+    assert torch.equal(make_probe(teacher, recorded, n_states=2, n_samples=24).samples, first.samples)
 
 
 def test_guidance_moves_a_teacher_with_cameras(tmp_path):
     dataset = record(tmp_path / "images", WITH_CAMERA)
     options = {**DIFFUSION, "crop_shape": None, "vision_backbone": "resnet18", "num_inference_steps": 4}
     teacher = make_teacher("diffusion", WITH_CAMERA, pretrained_backbone_weights=None, **options)
-    probe = make_probe(teacher, dataset, n_states=2, n_samples=20)
-    assert probe.samples.shape == (4, 20, 4, 2) and probe.states.has_cameras
+    probe = make_probe(teacher, dataset, n_states=2, n_samples=24)
+    assert probe.samples.shape == (4, 24, 4, 2) and probe.states.has_cameras
     alone, *guided = [pull for pull in probe.pulls() if pull.strategy != "nearest"]
     assert alone.moved == 0 and guided[-1].moved > guided[0].moved > 0

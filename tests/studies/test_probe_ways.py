@@ -63,14 +63,14 @@ def test_one_way_of_any_shape_is_one(shape):
 
 
 def test_a_deterministic_teacher_has_one_way():
-    ways = find_ways(np.full((32, 4), 0.7))
+    ways = find_ways(np.full((32, 4), 0.5))
     assert len(ways) == 1 and ways.weights.tolist() == [1.0] and ways.radii.tolist() == [0.0]
     assert ways.distances.tolist() == []
 
 
 def test_numbers_of_two_known_ways():
-    """30 samples at 0 and 10 at 1, in each of 4 dimensions."""
-    samples = np.repeat([0.0, 1.0], [30, 10])[:, None] + np.zeros((40, 4))
+    """36 samples at 0 and 12 at 1, in each of 4 dimensions."""
+    samples = np.repeat([0.0, 1.0], [36, 12])[:, None] + np.zeros((48, 4))
     ways = find_ways(samples)
     assert ways.weights.tolist() == [0.75, 0.25] and ways.distances.tolist() == [1.0]
     assert ways.centers.tolist() == [[0.0] * 4, [1.0] * 4]

@@ -31,6 +31,7 @@ from lerobot_agpd.studies.probe_states import RecordedStates
 from lerobot_agpd.studies.probe_verdict import (
     GUIDANCE_STRENGTHS,
     NEAREST_SAMPLES,
+    SAME,
     Evidence,
     Pull,
     PullName,
@@ -130,7 +131,7 @@ class TeacherProbe:
             Pull(
                 name,
                 strength,
-                moved=1 - _rms(pulled - self.targets[:, None]) / alone if alone > 0 else 0.0,
+                moved=1 - _rms(pulled - self.targets[:, None]) / alone if alone > SAME else 0.0,
                 chooses=self._average(pulled, self._chooses),
                 off=self._average(pulled, self._is_off),
             )

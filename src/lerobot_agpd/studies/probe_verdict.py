@@ -17,6 +17,9 @@ GUIDANCE_STRENGTHS = (0.5, 2.0, 8.0)
 NEAREST_SAMPLES = (4, 16)
 """Numbers of samples that `nearest` is tried with."""
 
+SAME = 1e-5
+"""Chunks are the same if they differ by less, as a root mean square in normalized actions: rounding does."""
+
 FALSE_ALARMS = 0.02
 """Several ways are found in a group of states if more than this fraction has them: that much is chance (docs/probe.md)."""
 
@@ -113,7 +116,7 @@ class Verdict:
 def conclude(evidence: Evidence) -> Verdict:
     """Whether guidance can help with this teacher, why, and the flags to type."""
     alone = "--policy.collect.strategy=teacher"
-    if evidence.spread == 0:
+    if evidence.spread < SAME:
         reason = (
             "The teacher always answers with the same chunk. It has one way per state: guidance has nothing to choose "
             "from, and the teacher collects alone (PD)."

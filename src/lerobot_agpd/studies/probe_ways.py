@@ -21,7 +21,7 @@ from lerobot_agpd.replay.episode import Array
 LEAST_WEIGHT = 0.05
 """Least fraction of a state's samples that makes a way; what is less stands between the ways."""
 
-LEAST_MEMBERS = 10
+LEAST_MEMBERS = 12
 """Least number of samples that makes a way: fewer clump by chance."""
 
 GAP = 2.0
