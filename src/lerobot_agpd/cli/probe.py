@@ -177,14 +177,15 @@ def probe_teacher(config: ProbeConfig) -> tuple[dict[str, Any], Verdict]:
     logger.info("%d samples at each of %d states", config.samples, len(probe.states))
     evidence = probe.evidence(probe.pulls())
     verdict = conclude(evidence)
-    latency = [{"steps": steps, "milliseconds": time} for steps, time in probe.latency()]
-    success = success_by_steps(config, [row["steps"] for row in latency])
-    if len(success) > 1:
-        rows = [
-            (row["steps"], row["mean"], timed["milliseconds"])
-            for row, timed in zip(success, latency, strict=True)
-        ]
-        verdict = replace(verdict, reasons=[*verdict.reasons, fewer_steps(rows)])
+    latency = probe.latency()
+    success = success_by_steps(config, [steps for steps, _ in latency])
+    costs = [
+        (steps, row["mean"], milliseconds)
+        for row, (steps, milliseconds) in zip(success, latency, strict=False)
+        if steps is not None
+    ]
+    if costs:
+        verdict = replace(verdict, reasons=[*verdict.reasons, fewer_steps(costs)])
     content = {
         "teacher": {**asdict(config.teacher), "type": probe.teacher.policy.config.type},
         "student": None if config.policy is None else str(config.policy.pretrained_path),
@@ -196,7 +197,7 @@ def probe_teacher(config: ProbeConfig) -> tuple[dict[str, Any], Verdict]:
         "denoising_steps": probe.teacher.n_denoising_steps,
         "evidence": asdict(evidence),
         "verdict": asdict(verdict),
-        "latency": latency,
+        "latency": [{"steps": steps, "milliseconds": time} for steps, time in latency],
         "success": success,
         "states": probe.rows(),
         "provenance": provenance(),

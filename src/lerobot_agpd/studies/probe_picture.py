@@ -29,7 +29,7 @@ def draw_probe(probe: TeacherProbe, content: Mapping[str, Any], path: Path) -> N
         path: of the picture.
     """
     figure = Figure(figsize=(3.6 * SHOWN, 7.5), layout="constrained", dpi=120)
-    upper, lower = figure.subfigures(2)
+    upper, lower = figure.subfigures(2, squeeze=False).ravel()
     states = shown_states(content["states"])
     for axis, state in zip(upper.subplots(1, SHOWN), states + [None] * (SHOWN - len(states)), strict=True):
         if state is None:
