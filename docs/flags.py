@@ -25,6 +25,7 @@ from lerobot_agpd.cli import (
     import_pusht,
     import_robomimic,
     merge,
+    probe,
     report,
     viz,
 )
@@ -38,6 +39,7 @@ COMMANDS = {
     "lerobot-agpd-demos": demos.DemosConfig,
     "lerobot-agpd-import-pusht": import_pusht.ImportPushTConfig,
     "lerobot-agpd-import-robomimic": import_robomimic.ImportRobomimicConfig,
+    "lerobot-agpd-probe": probe.ProbeConfig,
     "lerobot-agpd-compare": compare.CompareConfig,
     "lerobot-agpd-report": report.ReportConfig,
     "lerobot-agpd-viz": viz.VizConfig,

@@ -222,6 +222,28 @@ def check_fit(
     )
 
 
+def check_teacher(
+    teacher: Teacher, demonstrations: LeRobotDatasetMetadata, env_config: EnvConfig | None = None
+) -> None:
+    """Refuse demonstrations or an environment that a teacher without a student does not belong to.
+
+    Raises:
+        FlagError: naming both sides and what differs.
+    """
+    sources = {"the demonstrations (--dataset.*)": dataset_to_policy_features(demonstrations.features)}
+    if env_config is not None:
+        sources[f"the environment '{env_config.type}' (--env.*)"] = env_to_policy_features(env_config)
+    needed = tuple(teacher.action_feature.shape)
+    for source, features in sources.items():
+        _check_observations(teacher, source, features)
+        given = tuple(features[ACTION].shape)
+        require(
+            needed == given,
+            f"--policy.teacher.path: the teacher's actions have shape {needed}, those of {source} {given}; choose what "
+            "belongs to its task",
+        )
+
+
 def demonstrated_features(dataset_meta: LeRobotDatasetMetadata) -> Features:
     """Observation features that the demonstrations hold."""
     features = dataset_to_policy_features(dataset_meta.features)

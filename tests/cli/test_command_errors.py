@@ -12,6 +12,7 @@ PARSED = {
     "import_pusht": (["--source=nowhere", "--root=x"], "--source=nowhere"),
     "import_robomimic": (["nowhere.hdf5", "--root=x"], "--source=nowhere.hdf5"),
     "merge": (["--root=nowhere"], "--root=nowhere is not a folder"),
+    "probe": (["--output=x"], "--teacher.path is not set"),
     "report": (["--env.type=pusht", "--output=x", "--episodes=1", "--policies={a: .}"], "--episodes must be"),
     "demos": (["--env.type=gymnasium_robotics", "--root=x", "--episodes=0"], "--episodes"),
     "compare": (["--matrix=nowhere.yaml"], "--matrix=nowhere.yaml: no such file"),

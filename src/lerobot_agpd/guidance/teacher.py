@@ -113,6 +113,11 @@ class Teacher(ABC):
         return self.policy.config.n_action_steps
 
     @property
+    def n_denoising_steps(self) -> int | None:
+        """Denoising steps of a chunk as it samples now; None: it predicts in one pass."""
+        return None
+
+    @property
     def input_features(self) -> Features:
         """Observations it needs."""
         return self.policy.config.input_features

@@ -53,6 +53,20 @@ class RecordedFrames:
             return self._tasks[index]
         return self._locate(index)[0].task
 
+    def history(self, frame_index: Tensor, keys: Sequence[str], n_obs_steps: int) -> dict[str, Any]:
+        """Raw observation histories (B, n_obs_steps, ...) of frames, and their `task`s; an episode's first frame repeats."""
+        frame_index, deltas = frame_index.cpu(), torch.arange(1 - n_obs_steps, 1)
+        histories: dict[str, Any] = {"task": [self.task(index) for index in frame_index.tolist()]}
+        columns = self.table.columns
+        cameras = [key for key in keys if key not in columns]
+        if cameras:
+            starts, _ = self.table.episode_bounds(frame_index)
+            steps = (frame_index[:, None] + deltas).clamp(min=starts[:, None])  # (B, n_obs_steps)
+            images = self.images(steps.flatten(), cameras)
+            histories |= {key: images[key].unflatten(0, steps.shape) for key in cameras}
+        vectors = (key for key in keys if key in columns)
+        return histories | {key: self.table.gather(key, frame_index, deltas)[0] for key in vectors}
+
     def _locate(self, index: int) -> tuple[StoredEpisode, int]:
         frame = torch.tensor([index])
         number, (start, _) = int(self.table.episode(frame)), self.table.episode_bounds(frame)

@@ -207,17 +207,7 @@ class Replay:
 
     def history(self, frame_index: Tensor, keys: Sequence[str], n_obs_steps: int) -> Batch:
         """Raw observation histories (B, n_obs_steps, ...) of frames, for a teacher; with the frames' `task`s."""
-        frame_index, deltas = frame_index.cpu(), torch.arange(1 - n_obs_steps, 1)
-        histories: Batch = {"task": [self.frames.task(index) for index in frame_index.tolist()]}
-        columns = self.table.columns
-        cameras = [key for key in keys if key not in columns]
-        if cameras:
-            starts, _ = self.table.episode_bounds(frame_index)
-            steps = (frame_index[:, None] + deltas).clamp(min=starts[:, None])  # (B, n_obs_steps)
-            images = self.frames.images(steps.flatten(), cameras)
-            histories |= {key: images[key].unflatten(0, steps.shape) for key in cameras}
-        vectors = (key for key in keys if key in columns)
-        return histories | {key: self.table.gather(key, frame_index, deltas)[0] for key in vectors}
+        return self.frames.history(frame_index, keys, n_obs_steps)
 
     def executed_future(self, frame_index: Tensor, keys: Sequence[str], n_steps: int) -> ExecutedFuture:
         """What the representation learns from, for frames (B,) and vectors `keys`."""

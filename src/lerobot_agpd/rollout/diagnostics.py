@@ -163,10 +163,15 @@ def action_diagnostics(
         "rms_to_student": _rms(of_strategy - student),
         "rms_to_teacher": _rms(of_strategy - of_teacher),
         "rms_teacher_to_student": _rms(of_teacher - student),
-        "teacher_spread": float(of_teacher.var(dim=0).mean().sqrt()),
+        "teacher_spread": sample_spread(of_teacher),
         "kl_to_teacher": float(divergence.mean()),
         "kl_to_teacher_median": float(np.median(divergence)),
     }
+
+
+def sample_spread(samples: Tensor) -> float:
+    """Standard deviation of samples (K, ...) of one state or of several, over all their entries (sigma_E)."""
+    return float(samples.var(dim=0).mean().sqrt())
 
 
 def action_kl(actions: Tensor, reference: Tensor) -> Array:

@@ -21,8 +21,9 @@ from lerobot.scripts.lerobot_eval import eval_policy
 from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import seeded_context
 
-from lerobot_agpd.config import require
+from lerobot_agpd.config import TeacherConfig, require
 from lerobot_agpd.files import read_json, write_json
+from lerobot_agpd.guidance.adapters import as_teacher
 from lerobot_agpd.loading import load_policy, read_policy_config
 from lerobot_agpd.studies.latency import Latency, chunk_latency
 from lerobot_agpd.studies.provenance import digest
@@ -81,12 +82,24 @@ class Evaluator:
         return make_env(self.env_config, n_envs=self.n_envs, use_async_envs=False)
 
     def evaluate(
-        self, path: Path | str, episodes: int, seed: int, n_action_steps: int | None = None
+        self,
+        path: Path | str,
+        episodes: int,
+        seed: int,
+        n_action_steps: int | None = None,
+        sampler: TeacherConfig | None = None,
     ) -> Evaluation:
         """Evaluate a checkpoint on `episodes` environments from `seed` on, unless that is known already.
 
+        Args:
+            path: of the checkpoint.
+            episodes: number of environments.
+            seed: of the first.
+            n_action_steps: executed per prediction; None: as the checkpoint says.
+            sampler: denoising steps and noise scheduler of a policy that denoises; None: as the checkpoint says.
+
         Raises:
-            FlagError: if it cannot execute `n_action_steps` steps per prediction; None: the checkpoint's.
+            FlagError: if it cannot execute that many steps per prediction, or has no such sampler.
         """
         request = {
             "weights": digest(path),
@@ -97,12 +110,15 @@ class Evaluator:
             "batch_size": self.n_envs,
             "device": self.device,
         }
+        if sampler is not None:
+            request["sampler"] = [sampler.num_inference_steps, sampler.noise_scheduler]
         name = hashlib.sha256(json.dumps(request, sort_keys=True, default=str).encode()).hexdigest()[:16]
         file = self.folder / EVALUATIONS / f"{name}.json"
         if file.is_file():
             stored = read_json(file)
             return Evaluation(**{key: stored[key] for key in stored if key != "request"})
-        evaluation = self._roll_out(checkpoint_config(path, self.device, n_action_steps), episodes, seed)
+        config = checkpoint_config(path, self.device, n_action_steps)
+        evaluation = self._roll_out(config, episodes, seed, sampler or TeacherConfig())
         file.parent.mkdir(parents=True, exist_ok=True)
         write_json(file, {"request": request, **asdict(evaluation)})
         logger.info("evaluated %s: success %s", path, success_rate(evaluation.successes))
@@ -112,9 +128,16 @@ class Evaluator:
         """Time one chunk of a checkpoint at batch size 1."""
         return chunk_latency(load_policy(checkpoint_config(path, self.device)).policy)
 
-    def _roll_out(self, config: PreTrainedConfig, n_episodes: int, start_seed: int) -> Evaluation:
+    def _roll_out(
+        self, config: PreTrainedConfig, n_episodes: int, start_seed: int, sampler: TeacherConfig
+    ) -> Evaluation:
         """Roll out episodes from consecutive seeds as `lerobot-eval` does; policies that sample are seeded, too."""
         loaded = load_policy(config)
+        if sampler.num_inference_steps is not None or sampler.noise_scheduler is not None:
+            teacher = as_teacher(
+                loaded.policy, loaded.preprocessor, loaded.postprocessor
+            )  # shares the policy
+            teacher.set_sampler(sampler.num_inference_steps, sampler.noise_scheduler)
         processors = make_env_pre_post_processors(self.env_config, config)
         episodes: list[dict[str, Any]] = []
         for envs in (envs for suite in self.environments.values() for envs in suite.values()):

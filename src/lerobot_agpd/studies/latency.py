@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,21 +34,31 @@ def chunk_latency(
         warmup: calls before those.
     """
     batch = random_observations(policy, batch_size)
-    times = []
-    for repeat in range(repeats + warmup):
+
+    def predict() -> None:
         policy.reset()
-        start = time.perf_counter()
         policy.predict_action_chunk(dict(batch))
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
-        if repeat >= warmup:
-            times.append(1e3 * (time.perf_counter() - start))
+
+    times = call_times(predict, repeats, warmup)
     return Latency(
         median_ms=float(np.median(times)),
         p95_ms=float(np.quantile(times, 0.95)),
         n_parameters=acting_parameters(policy),
         threads=torch.get_num_threads(),
     )
+
+
+def call_times(call: Callable[[], object], repeats: int, warmup: int = 3) -> list[float]:
+    """Milliseconds of each of `repeats` calls, after `warmup` calls that are not timed."""
+    times = []
+    for repeat in range(repeats + warmup):
+        start = time.perf_counter()
+        call()
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+        if repeat >= warmup:
+            times.append(1e3 * (time.perf_counter() - start))
+    return times
 
 
 def random_observations(policy: PreTrainedPolicy, batch_size: int) -> dict[str, torch.Tensor]:

@@ -44,6 +44,11 @@ class DiffusionTeacher(Teacher):
         return self.policy.config.horizon - self.start
 
     @property
+    def n_denoising_steps(self) -> int | None:
+        """Steps of its scheduler."""
+        return self.policy.diffusion.num_inference_steps
+
+    @property
     def resizes_images(self) -> bool:
         """Whether it accepts images of any size."""
         return self.policy.config.resize_shape is not None

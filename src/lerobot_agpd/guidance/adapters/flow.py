@@ -20,6 +20,13 @@ class MultiTaskDiTTeacher(DiffusionTeacher):
     """
 
     @property
+    def n_denoising_steps(self) -> int | None:
+        """Steps of the scheduler, or Euler steps of the flow."""
+        if self.policy.config.is_diffusion:
+            return self.policy.objective.num_inference_steps
+        return self.policy.config.num_integration_steps
+
+    @property
     def resizes_images(self) -> bool:
         """Whether it accepts images of any size."""
         return self.policy.config.image_resize_shape is not None

@@ -56,6 +56,16 @@ class RTCTeacher(Teacher):
         return {key: feature for key, feature in features.items() if EMPTY_CAMERA not in key}
 
     @property
+    def n_denoising_steps(self) -> int | None:
+        """Euler steps."""
+        return getattr(self.policy.config, self._steps_field)
+
+    @property
+    def _steps_field(self) -> str:
+        """Where the configuration holds the number of Euler steps."""
+        return "num_steps" if hasattr(self.policy.config, "num_steps") else "num_inference_steps"
+
+    @property
     def resizes_images(self) -> bool:
         """Whether it accepts images of any size."""
         return True
@@ -70,9 +80,7 @@ class RTCTeacher(Teacher):
         if noise_scheduler is not None:
             raise self.no_such_setting("noise_scheduler", noise_scheduler, "integrates a flow")
         if num_inference_steps is not None:
-            config = self.policy.config
-            field = "num_steps" if hasattr(config, "num_steps") else "num_inference_steps"
-            setattr(config, field, num_inference_steps)
+            setattr(self.policy.config, self._steps_field, num_inference_steps)
 
     def _sample_chunk(
         self, batch: dict[str, Tensor], guide: Guide | None, generator: torch.Generator | None
