@@ -6,7 +6,7 @@ shows is stored. `meta/dapg.json` says how far every episode went from the recor
 
 import json
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -129,7 +129,7 @@ def replayed_episodes(
     env_config: GymnasiumRoboticsEnv,
     config: ImportAdroitConfig,
     report: AdroitReport,
-    on_episode: Any,
+    on_episode: Callable[[], None],
 ) -> Iterator[list[Frame]]:
     """Yield the frames of every kept episode.
 

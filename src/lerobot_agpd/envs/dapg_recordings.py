@@ -25,7 +25,7 @@ INITIAL_STATES: dict[str, dict[str, int]] = {
     "AdroitHandPen-v1": {"qpos": 30, "qvel": 30, "desired_orien": 4},
     "AdroitHandRelocate-v1": {"qpos": 36, "qvel": 36, "obj_pos": 3, "target_pos": 3},
 }
-"""Arrays, with their lengths, that Gymnasium-Robotics resets each task to; each task is known by the last of them."""
+"""Arrays, with their lengths, that Gymnasium-Robotics resets each task to; they tell which task a file is of."""
 
 STEP_KEYS = ("observations", "actions", "rewards")
 INIT_PREFIX = "init_"
@@ -61,23 +61,23 @@ def read_recordings(source: Path) -> list[Recording]:
     """
     episodes = _split_npz(source) if source.suffix == ".npz" else load_arrays(source)
     if not isinstance(episodes, list) or not episodes:
-        raise ValueError(f"{source} must hold a list of episodes, found {_describe(episodes)}")
+        found = "an empty list" if episodes == [] else f"a {type(episodes).__name__}"
+        raise ValueError(f"{source} must hold a list of episodes, found {found}")
     recordings = [_recording(episode, f"{source}: episode {index}") for index, episode in enumerate(episodes)]
     if len(tasks := sorted({recording.task for recording in recordings})) > 1:
         raise ValueError(f"{source} mixes the tasks {', '.join(tasks)}; expected one")
     return recordings
 
 
-def _describe(value: Any) -> str:
-    return f"an empty {type(value).__name__}" if value in ([], {}) else f"a {type(value).__name__}"
-
-
 def _split_npz(path: Path) -> list[dict[str, Any]]:
     """Episodes of an .npz file in the form of DAPG's pickles."""
     if not zipfile.is_zipfile(path):
         raise ValueError(f"{path} is not an .npz file")
-    with np.load(path) as archive:
-        arrays = dict(archive)
+    try:
+        with np.load(path) as archive:
+            arrays = dict(archive)
+    except Exception as error:  # a damaged archive may raise anything
+        raise ValueError(f"{path} cannot be read: {error}") from error
     required = (*STEP_KEYS, "episode_ends")
     if missing := [key for key in required if key not in arrays]:
         raise ValueError(f"{path} has no array {missing}; found {sorted(arrays)}")
@@ -117,14 +117,14 @@ def _recording(episode: Any, where: str) -> Recording:
         raise ValueError(f"{where}: the initial state {names} is none of {_known_states()}")
     task = matching[0]
     spec = TASKS[task]
-    n_steps = len(episode["actions"])
+    n_steps = np.shape(episode["actions"])[0] if np.ndim(episode["actions"]) else 0
     shapes: dict[str, tuple[int, ...]] = {
         "observations": (n_steps, len(spec.agent) + len(spec.scene)),
         "actions": (n_steps, spec.action_dim),
         "rewards": (n_steps,),
     }
     if n_steps == 0:
-        raise ValueError(f"{where} has no steps")
+        raise ValueError(f"{where} has no actions")
     return Recording(
         task=task,
         **{key: _checked(episode[key], shape, f"{where}: {key}") for key, shape in shapes.items()},
