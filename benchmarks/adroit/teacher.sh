@@ -7,7 +7,7 @@ export HF_HUB_OFFLINE=1 OMP_NUM_THREADS=${OMP_NUM_THREADS:-1} MUJOCO_GL=${MUJOCO
 root=$1 output=$2
 shift 2
 last="$output/checkpoints/last/pretrained_model"
-lerobot-train --config_path="$here/../../examples/presets/teacher_cpu.yaml" --policy.use_amp=true \
+lerobot-train --config_path="$here/../../examples/presets/teacher_cpu.yaml" \
     --dataset.repo_id=local/adroit --dataset.root="$root" \
     --seed=1000 --log_freq=500 --save_freq=2000 --output_dir="$output" "$@"
 lerobot-eval --policy.path="$last" --policy.device=cpu \

@@ -100,8 +100,8 @@ def test_frames_are_those_of_the_file_with_actions_clipped(task, tmp_path):
     np.testing.assert_array_equal(
         column(dataset, "action"), np.clip(expected["actions"], -1, 1).astype(np.float32)
     )
-    np.testing.assert_allclose(column(dataset, "next.reward")[:, 0], expected["rewards"], atol=1e-3)
-    assert column(dataset, "next.done")[:, 0].tolist() == [False] * 5 + [True] + [False] * 3 + [True]
+    np.testing.assert_allclose(column(dataset, "next.reward").ravel(), expected["rewards"], atol=1e-3)
+    assert column(dataset, "next.done").ravel().tolist() == [False] * 5 + [True] + [False] * 3 + [True]
     assert column(dataset, "episode_index").tolist() == [0] * 6 + [1] * 4
     assert dataset[0]["task"] == TASKS[task].description
 
@@ -176,12 +176,12 @@ def test_successful_episodes_are_told_apart(tmp_path, door):
     assert entry["success_at_any_step"] and entry["success_at_last_step"]
 
 
-def test_command_says_how_to_replay(source, tmp_path, monkeypatch, caplog):
+def test_command_says_how_to_replay(source, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["command", f"--source={source}", f"--root={tmp_path / 'out'}"])
-    with caplog.at_level("INFO"):
-        command.main()
-    assert "0 of them reach the goal" in caplog.text
-    assert f"--env.task={DOOR} --env.episode_length=6" in caplog.text
+    command.main()
+    printed = capsys.readouterr().err
+    assert "0 of them reach the goal" in printed
+    assert f"--env.task={DOOR} --env.episode_length=6" in printed
 
 
 def spoiled(key, change):
