@@ -9,13 +9,10 @@ import json
 import logging
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 from datasets import disable_progress_bars
-from lerobot.configs import FeatureType
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
-from lerobot.utils.constants import DONE, REWARD, SUCCESS
 from rich.console import Console
 from rich.table import Table
 from scipy.stats import binomtest
@@ -23,9 +20,9 @@ from scipy.stats import binomtest
 from lerobot_agpd.cli.command import entry_point
 from lerobot_agpd.cli.progress import episode_bar
 from lerobot_agpd.config import EVALUATION_SEEDS, FlagError, require
-from lerobot_agpd.dataset_writer import DatasetWriter, flag, image, vector
+from lerobot_agpd.dataset_writer import DatasetWriter, vector
 from lerobot_agpd.envs.base import SimulatedEnvConfig
-from lerobot_agpd.envs.demonstrations import SKILL, DemosReport, successful_episodes
+from lerobot_agpd.envs.demonstrations import SKILL, DemosReport, dataset_features, successful_episodes
 from lerobot_agpd.envs.experts import make_expert
 from lerobot_agpd.envs.experts.base import Expert
 from lerobot_agpd.envs.experts.ways import WaysExpert
@@ -105,18 +102,6 @@ class DemosConfig:
         return range(self.seed, min(end, EVALUATION_SEEDS[0]))
 
 
-def dataset_features(config: DemosConfig) -> dict[str, dict[str, Any]]:
-    """Features of a recorded frame: the environment's, reward, success, end of the episode and perhaps the skill."""
-    features = {
-        config.env.features_map[key]: image(tuple(feature.shape))
-        if feature.type is FeatureType.VISUAL
-        else vector(*feature.shape)
-        for key, feature in config.env.features.items()
-    }
-    features |= {REWARD: vector(1), SUCCESS: flag(), DONE: flag()}
-    return features if config.skills == [1.0] else features | {SKILL: vector(1)}
-
-
 def record_demos(config: DemosConfig) -> DemosReport:
     """Record the dataset.
 
@@ -127,7 +112,10 @@ def record_demos(config: DemosConfig) -> DemosReport:
     """
     assert isinstance(config.env, SimulatedEnvConfig) and config.env.fps is not None  # as all with experts
     report = DemosReport(task=str(config.env.task))
-    writer = DatasetWriter(config.root, config.repo_id, config.env.fps, dataset_features(config))
+    features = dataset_features(config.env)
+    if config.skills != [1.0]:
+        features[SKILL] = vector(1)
+    writer = DatasetWriter(config.root, config.repo_id, config.env.fps, features)
 
     def add_report(folder: Path) -> None:
         (folder / REPORT_PATH).write_text(json.dumps(asdict(report), indent=2) + "\n")

@@ -5,10 +5,12 @@ from dataclasses import dataclass, field
 
 import gymnasium as gym
 import numpy as np
+from lerobot.configs import FeatureType
+from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, DONE, REWARD, SUCCESS
 from lerobot.utils.utils import flatten_dict
 
-from lerobot_agpd.dataset_writer import Frame
+from lerobot_agpd.dataset_writer import Feature, Frame, flag, image, vector
 from lerobot_agpd.envs.experts.base import Expert, Observation
 from lerobot_agpd.envs.experts.ways import WaysExpert
 from lerobot_agpd.envs.operators import Operator
@@ -45,6 +47,42 @@ class DemosReport:
         return len(self.seeds) + len(self.solved_at_start_seeds) + len(self.failed_seeds)
 
 
+def dataset_features(env: EnvConfig) -> dict[str, Feature]:
+    """Features of a recorded frame: the environment's, reward, success and end of the episode."""
+    observed = {
+        env.features_map[key]: image(tuple(feature.shape))
+        if feature.type is FeatureType.VISUAL
+        else vector(*feature.shape)
+        for key, feature in env.features.items()
+    }
+    return {**observed, REWARD: vector(1), SUCCESS: flag(), DONE: flag()}
+
+
+def play_step(
+    env: gym.Env, observation: Observation, action: np.ndarray, features_map: dict[str, str]
+) -> tuple[Frame, Observation]:
+    """Play one action.
+
+    Args:
+        env: a single environment with LeRobot's raw keys.
+        observation: raw observation in which the action is played.
+        action: (A,).
+        features_map: raw key to dataset key.
+
+    Returns:
+        The dataset frame, whose reward, success and end are those of the state that the action leads to, and the raw
+        observation of that state.
+    """
+    frame = {features_map[key]: value for key, value in flatten_dict(observation).items()}
+    following, reward, terminated, truncated, info = env.step(action)
+    frame["task"] = env.get_wrapper_attr("task_description")
+    frame[ACTION] = action
+    frame[REWARD] = np.array([reward], dtype=np.float32)
+    frame[SUCCESS] = np.array([info["is_success"]], dtype=bool)
+    frame[DONE] = np.array([terminated or truncated], dtype=bool)
+    return frame, following
+
+
 def play_episode(
     env: gym.Env, expert: Callable[[Observation], np.ndarray], seed: int, features_map: dict[str, str]
 ) -> list[Frame] | None:
@@ -63,17 +101,8 @@ def play_episode(
     if info["is_success"]:
         return None
     frames: list[Frame] = []
-    done = False
-    while not done:
-        action = expert(env.get_wrapper_attr("state"))
-        frame = {features_map[key]: value for key, value in flatten_dict(observation).items()}
-        observation, reward, terminated, truncated, info = env.step(action)
-        done = terminated or truncated
-        frame["task"] = env.get_wrapper_attr("task_description")
-        frame[ACTION] = action
-        frame[REWARD] = np.array([reward], dtype=np.float32)
-        frame[SUCCESS] = np.array([info["is_success"]], dtype=bool)
-        frame[DONE] = np.array([done], dtype=bool)
+    while not frames or not frames[-1][DONE].item():
+        frame, observation = play_step(env, observation, expert(env.get_wrapper_attr("state")), features_map)
         frames.append(frame)
     return frames
 
