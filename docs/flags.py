@@ -22,6 +22,7 @@ from lerobot_agpd.cli import (
     demos,
     diversity,
     export,
+    import_adroit,
     import_pusht,
     import_robomimic,
     merge,
@@ -37,6 +38,7 @@ DERIVED = ("features", "features_map")
 PAGE = Path(__file__).with_name("flags.md")
 COMMANDS = {
     "lerobot-agpd-demos": demos.DemosConfig,
+    "lerobot-agpd-import-adroit": import_adroit.ImportAdroitConfig,
     "lerobot-agpd-import-pusht": import_pusht.ImportPushTConfig,
     "lerobot-agpd-import-robomimic": import_robomimic.ImportRobomimicConfig,
     "lerobot-agpd-probe": probe.ProbeConfig,

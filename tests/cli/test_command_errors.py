@@ -9,6 +9,7 @@ from lerobot.envs.configs import PushtEnv
 from lerobot_agpd.studies.parsing import decode_environment
 
 PARSED = {
+    "import_adroit": (["--source=nowhere", "--root=x"], "--source=nowhere"),
     "import_pusht": (["--source=nowhere", "--root=x"], "--source=nowhere"),
     "import_robomimic": (["nowhere.hdf5", "--root=x"], "--source=nowhere.hdf5"),
     "merge": (["--root=nowhere"], "--root=nowhere is not a folder"),

@@ -9,6 +9,7 @@ the initial state.
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,26 @@ def read_recordings(source: Path) -> list[Recording]:
 
 def _split_npz(path: Path) -> list[dict[str, Any]]:
     """Episodes of an .npz file in the form of DAPG's pickles."""
+    arrays = _read_npz(path)
+    bounds = _episode_bounds(arrays, path)
+    init = {key: values for key, values in arrays.items() if key.startswith(INIT_PREFIX)}
+    n_episodes = len(bounds) - 1
+    for keys, length in ((STEP_KEYS, bounds[-1]), (init, n_episodes)):
+        for key in keys:
+            if (n_rows := len(np.atleast_1d(arrays[key]))) != length:
+                raise ValueError(
+                    f"{path}: {key} has {n_rows} rows, episode_ends has {n_episodes} episodes and {bounds[-1]} rows"
+                )
+    return [
+        {
+            **{key: arrays[key][start:end] for key in STEP_KEYS},
+            "init_state_dict": {key.removeprefix(INIT_PREFIX): values[row] for key, values in init.items()},
+        }
+        for row, (start, end) in enumerate(pairwise(bounds))
+    ]
+
+
+def _read_npz(path: Path) -> dict[str, Array]:
     if not zipfile.is_zipfile(path):
         raise ValueError(f"{path} is not an .npz file")
     try:
@@ -78,53 +99,42 @@ def _split_npz(path: Path) -> list[dict[str, Any]]:
             arrays = dict(archive)
     except Exception as error:  # a damaged archive may raise anything
         raise ValueError(f"{path} cannot be read: {error}") from error
-    required = (*STEP_KEYS, "episode_ends")
-    if missing := [key for key in required if key not in arrays]:
+    if missing := [key for key in (*STEP_KEYS, "episode_ends") if key not in arrays]:
         raise ValueError(f"{path} has no array {missing}; found {sorted(arrays)}")
+    return arrays
+
+
+def _episode_bounds(arrays: Mapping[str, Array], path: Path) -> list[int]:
+    """Rows at which episodes begin, and the number of rows at the end."""
     ends = arrays["episode_ends"]
     if ends.ndim != 1 or ends.dtype.kind not in "iu" or len(ends) == 0:
         raise ValueError(f"{path}: episode_ends must be row numbers, found {ends.dtype} {ends.shape}")
     bounds = [0, *ends.tolist()]
-    if any(end <= start for start, end in zip(bounds, bounds[1:], strict=False)):
+    if any(end <= start for start, end in pairwise(bounds)):
         raise ValueError(f"{path}: episode_ends must rise from episode to episode, found {bounds[1:11]}")
-    for key in STEP_KEYS:
-        if len(arrays[key]) != bounds[-1]:
-            raise ValueError(
-                f"{path}: {key} has {len(arrays[key])} rows, episode_ends reaches row {bounds[-1]}"
-            )
-    init = {key: values for key, values in arrays.items() if key.startswith(INIT_PREFIX)}
-    for key, values in init.items():
-        if len(values) != len(ends):
-            raise ValueError(f"{path}: {key} has {len(values)} rows, episode_ends {len(ends)} episodes")
-    return [
-        {
-            **{key: arrays[key][start:end] for key in STEP_KEYS},
-            "init_state_dict": {key.removeprefix(INIT_PREFIX): values[row] for key, values in init.items()},
-        }
-        for row, (start, end) in enumerate(zip(bounds, bounds[1:], strict=False))
-    ]
+    return bounds
 
 
 def _recording(episode: Any, where: str) -> Recording:
+    """Check one episode of a pickle."""
     required = (*STEP_KEYS, "init_state_dict")
-    found = sorted(episode) if isinstance(episode, Mapping) else type(episode).__name__
     if not isinstance(episode, Mapping) or not set(required) <= set(episode):
+        found = list(episode) if isinstance(episode, Mapping) else f"a {type(episode).__name__}"
         raise ValueError(f"{where} must be a dict with {', '.join(required)}; found {found}")
     state = episode["init_state_dict"]
-    names = sorted(state) if isinstance(state, Mapping) else type(state).__name__
-    matching = [task for task, sizes in INITIAL_STATES.items() if set(sizes) <= set(names)]
-    if not isinstance(state, Mapping) or len(matching) != 1:
-        raise ValueError(f"{where}: the initial state {names} is none of {_known_states()}")
-    task = matching[0]
-    spec = TASKS[task]
-    n_steps = np.shape(episode["actions"])[0] if np.ndim(episode["actions"]) else 0
+    names = list(state) if isinstance(state, Mapping) else []
+    task = next((task for task, sizes in INITIAL_STATES.items() if set(sizes) <= set(names)), None)
+    if task is None:
+        raise ValueError(f"{where}: the initial state has {names}, expected one of {_known_states()}")
+    actions, spec = episode["actions"], TASKS[task]
+    n_steps = len(actions) if isinstance(actions, np.ndarray) and actions.ndim else 0
+    if n_steps == 0:
+        raise ValueError(f"{where} has no actions")
     shapes: dict[str, tuple[int, ...]] = {
         "observations": (n_steps, len(spec.agent) + len(spec.scene)),
         "actions": (n_steps, spec.action_dim),
         "rewards": (n_steps,),
     }
-    if n_steps == 0:
-        raise ValueError(f"{where} has no actions")
     return Recording(
         task=task,
         **{key: _checked(episode[key], shape, f"{where}: {key}") for key, shape in shapes.items()},
