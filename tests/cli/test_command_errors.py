@@ -11,6 +11,7 @@ from lerobot_agpd.studies.parsing import decode_environment
 PARSED = {
     "import_pusht": (["--source=nowhere", "--root=x"], "--source=nowhere"),
     "import_robomimic": (["nowhere.hdf5", "--root=x"], "--source=nowhere.hdf5"),
+    "doctor": (["--run=nowhere"], "--run=nowhere is not a folder"),
     "merge": (["--root=nowhere"], "--root=nowhere is not a folder"),
     "report": (["--env.type=pusht", "--output=x", "--episodes=1", "--policies={a: .}"], "--episodes must be"),
     "demos": (["--env.type=gymnasium_robotics", "--root=x", "--episodes=0"], "--episodes"),
