@@ -91,12 +91,12 @@ def load_policy(config: PreTrainedConfig) -> LoadedPolicy:
         ValueError: naming the file, if one is damaged.
     """
     path = str(config.pretrained_path)
-    policy_class = get_policy_class(config.type)  # imports the processor steps of its package, too
     require_known_policy(config, path)
     processors = load_processors(path, config)
     if Path(path).is_dir():
         require_safetensors(Path(path))
-    return LoadedPolicy(policy_class.from_pretrained(path, config=config).eval(), *processors)
+    policy = get_policy_class(config.type).from_pretrained(path, config=config)
+    return LoadedPolicy(policy.eval(), *processors)
 
 
 def load_teacher(config: TeacherConfig, device: str) -> Teacher:

@@ -17,7 +17,7 @@ from typing import Any
 from huggingface_hub import hf_hub_download
 from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.configs import PreTrainedConfig
-from lerobot.policies import make_pre_post_processors
+from lerobot.policies import get_policy_class, make_pre_post_processors
 from lerobot.processor import (
     PolicyAction,
     PolicyProcessorPipeline,
@@ -79,6 +79,7 @@ def load_processors(path: str | Path, config: PreTrainedConfig) -> Processors:
         FlagError: if a file names a step that is not admitted, or the checkpoint has no processor files.
         ValueError: naming the file, if one is damaged.
     """
+    get_policy_class(config.type)  # registers the processor steps of its package
     revision = config.pretrained_revision
     for name in PROCESSOR_FILES:
         file = _processor_file(path, name, revision)

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from huggingface_hub.constants import CONFIG_NAME, SAFETENSORS_SINGLE_FILE
 from lerobot.configs.train import TRAIN_CONFIG_NAME
+from lerobot.policies import get_policy_class
 from lerobot.utils.constants import (
     CHECKPOINTS_DIR,
     LAST_CHECKPOINT_LINK,
@@ -117,6 +118,7 @@ def _examine(folder: Path) -> Iterator[Finding]:
     for name in NEEDED:
         if not (folder / name).is_file():
             yield Finding(Severity.BROKEN, "checkpoints", f"{folder / name} is missing", remedy)
+    yield from _policy_package(folder / PRETRAINED_MODEL_DIR / CONFIG_NAME)
     for path in sorted(folder.rglob("*.json")):
         try:
             check_steps(path) if path.name in PROCESSOR_FILES else read_json(path) if _is_object(
@@ -126,6 +128,20 @@ def _examine(folder: Path) -> Iterator[Finding]:
             yield Finding.of(Severity.BROKEN, "checkpoints", str(error).partition("; ")[0], remedy)
     for path in sorted(folder.rglob("*.safetensors")):
         yield from _tensors(path, remedy)
+
+
+def _policy_package(path: Path) -> Iterator[Finding]:
+    """Import the package of a checkpoint's policy, whose processor steps are known only then."""
+    try:
+        policy_type = str(read_json(path).get("type"))
+    except (ValueError, FileNotFoundError):
+        return  # found by the others
+    try:
+        get_policy_class(policy_type)
+    except Exception as error:  # whatever somebody else's package raises
+        text = f"{path}: the policy type '{policy_type}' cannot be imported ({' '.join(str(error).split())[:200]})"
+        remedy = "install the plugin that has it, or the extra of LeRobot that the error names"
+        yield Finding(Severity.BROKEN, "checkpoints", text, remedy)
 
 
 def _is_object(path: Path) -> bool:
