@@ -58,7 +58,8 @@ def add_step(checkpoint: Path, name: str, **entry) -> Path:
 def test_lerobots_own_loader_runs_it(checkpoint, payload):
     """What this is about; once LeRobot refuses it itself, the check can go."""
     add_step(checkpoint, PROCESSOR_FILES[0], **{"class": "agpd_payload.run"})
-    make_pre_post_processors(read_policy_config(checkpoint, "--flag"), pretrained_path=str(checkpoint))
+    with pytest.raises(TypeError, match="must inherit from ProcessorStep"):  # what it returned; it has run
+        make_pre_post_processors(read_policy_config(checkpoint, "--flag"), pretrained_path=str(checkpoint))
     assert payload() == ["called", "imported"]
 
 
