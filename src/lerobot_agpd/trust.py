@@ -85,7 +85,9 @@ def load_processors(path: str | Path, config: PreTrainedConfig) -> Processors:
         file = _processor_file(path, name, revision)
         if not Path(path).is_dir():
             revision = file.parent.name  # the commit: what is built below is what was checked
-        check_steps(file)
+        for statistics in check_steps(file):
+            if statistics.exists():  # LeRobot fetches those of a Hub repository
+                stored_shapes(statistics, RESTORE)
     return make_pre_post_processors(
         config,
         pretrained_path=str(path),
@@ -94,12 +96,15 @@ def load_processors(path: str | Path, config: PreTrainedConfig) -> Processors:
     )
 
 
-def check_steps(file: Path) -> None:
-    """Refuse a processor file with a step that is not admitted, or with statistics that cannot be read.
+def check_steps(file: Path) -> list[Path]:
+    """Refuse a processor file with a step that is not admitted.
+
+    Returns:
+        The files of statistics that it names.
 
     Raises:
         FlagError: naming file, step and class.
-        ValueError: if the file or a file of statistics beside it is damaged.
+        ValueError: if the file is damaged.
     """
     steps = read_json(file, RESTORE).get("steps")
     if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
@@ -114,11 +119,7 @@ def check_steps(file: Path) -> None:
                 "named lerobot_policy_*) that has the step"
             )
         _require_known_code(step_class, entry.get("config") or {}, f"{file}, step {number} ('{named}')")
-        state = entry.get("state_file")
-        if (
-            state is not None and (file.parent / str(state)).exists()
-        ):  # LeRobot fetches those of a Hub repository
-            stored_shapes(file.parent / str(state), RESTORE)
+    return [file.parent / str(entry["state_file"]) for entry in steps if entry.get("state_file")]
 
 
 def _step_class(entry: Mapping[str, Any]) -> type[ProcessorStep] | None:

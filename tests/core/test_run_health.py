@@ -29,7 +29,7 @@ def originals() -> dict[str, Path]:
 
 @pytest.fixture
 def run(originals, start, point_demonstrations, tmp_path) -> Path:
-    """A run of two finished rounds, killed in its third one, with checkpoints after steps 4 and 7."""
+    """A run of two finished rounds, with checkpoints after steps 4 and 7 of 10."""
     if not originals:
         training = start()
         for until in (4, 7):
@@ -67,7 +67,8 @@ def test_a_healthy_run(run):
     n_kept = sum('"kept": true' in line for path in run.glob("agpd/round-*/*.jsonl") for line in path.open())
     assert f"2 finished rounds, {n_kept} kept episodes; 2 of 2 rounds intact" in episodes
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
-    assert examine_run(run) == findings, "deterministic"
+    again = [finding for finding in examine_run(run) if finding.area != "disk"]
+    assert again == [finding for finding in findings if finding.area != "disk"], "deterministic"
     assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before, "nothing is changed"
 
 
@@ -131,7 +132,7 @@ DAMAGE = {
     "truncated report": ("agpd/round-00001/report.json", truncate, "restore it"),
     "foreign report": ("agpd/round-00001/report.json", empty_object, "restore it"),
     "truncated journal": ("agpd/journal.json", truncate, "restore it"),
-    "missing journal": ("agpd/journal.json", Path.unlink, ""),
+    "missing journal": ("agpd/journal.json", Path.unlink, "restore it"),
     "missing round": ("agpd/round-00000", shutil.rmtree, "restore it"),
     "truncated weights": (LAST + "pretrained_model/model.safetensors", truncate, "restore the file"),
     "missing weights": (LAST + "pretrained_model/model.safetensors", Path.unlink, "restore the file"),
@@ -150,14 +151,10 @@ def test_damage_is_named_with_path_and_remedy(run, name):
     pattern, damage, remedy = DAMAGE[name]
     path = sorted(run.glob(pattern))[0]
     damage(path)
-    findings = examine_run(run)
-    (found,) = [
-        finding
-        for finding in findings
-        if finding.severity is Severity.BROKEN and str(path) in finding.text + finding.remedy
-    ]
     named = path.with_name("report.json") if name == "missing index line" else path
-    assert str(named) in found.text and remedy in found.remedy
+    broken = [finding for finding in examine_run(run) if finding.severity is Severity.BROKEN]
+    (found,) = [finding for finding in broken if str(named) in finding.text]
+    assert remedy in found.remedy
     assert "\n" not in found.text + found.remedy
 
 
@@ -196,7 +193,7 @@ def test_rounds_that_a_checkpoint_has_used(run):
     assert "has used 2 rounds" in found.text and "--policy.replay.root" in found.remedy
     shutil.rmtree(run / "agpd")
     (found,) = [finding for finding in faults(examine_run(run)) if finding.area == "episodes"]
-    assert f"{run / 'agpd'} is missing" in found.text
+    assert f"{run / 'agpd'} is missing; the run goes on with the episodes in" in found.text
 
 
 def test_an_unfinished_round_and_leftovers_are_no_fault(run):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from lerobot.utils.constants import (
 )
 from safetensors import SafetensorError, safe_open
 
+from lerobot_agpd.config import FlagError
 from lerobot_agpd.files import read_json
 from lerobot_agpd.health.finding import Finding, Severity, is_broken
 from lerobot_agpd.progress import STATE_FILE
@@ -120,12 +122,7 @@ def _examine(folder: Path) -> Iterator[Finding]:
             yield Finding(Severity.BROKEN, "checkpoints", f"{folder / name} is missing", remedy)
     yield from _policy_package(folder / PRETRAINED_MODEL_DIR / CONFIG_NAME)
     for path in sorted(folder.rglob("*.json")):
-        try:
-            check_steps(path) if path.name in PROCESSOR_FILES else read_json(path) if _is_object(
-                path
-            ) else None
-        except ValueError as error:
-            yield Finding.of(Severity.BROKEN, "checkpoints", str(error).partition("; ")[0], remedy)
+        yield from _text(path, remedy)
     for path in sorted(folder.rglob("*.safetensors")):
         yield from _tensors(path, remedy)
 
@@ -144,9 +141,20 @@ def _policy_package(path: Path) -> Iterator[Finding]:
         yield Finding(Severity.BROKEN, "checkpoints", text, remedy)
 
 
-def _is_object(path: Path) -> bool:
-    """Whether a file should hold a JSON object; LeRobot writes the optimizer's groups as a list."""
-    return path.name != OPTIMIZER_PARAM_GROUPS
+def _text(path: Path, remedy: str) -> Iterator[Finding]:
+    """Whether a JSON file can be read, and a processor file names nothing but processor steps."""
+    try:
+        if path.name in PROCESSOR_FILES:
+            check_steps(path)
+        elif path.name == OPTIMIZER_PARAM_GROUPS:  # a list
+            json.loads(path.read_text())
+        else:
+            read_json(path)
+    except FlagError as error:
+        yield Finding.of(Severity.BROKEN, "checkpoints", error)
+    except ValueError as error:
+        text = str(error) if str(path) in str(error) else f"{path} is damaged ({error})"
+        yield Finding(Severity.BROKEN, "checkpoints", text.partition("; ")[0], remedy)
 
 
 def _tensors(path: Path, remedy: str) -> Iterator[Finding]:

@@ -20,6 +20,8 @@ from lerobot_agpd.rollout.report import RoundReport, Tally
 
 AREA = "episodes"
 
+ANOTHER = "restore it, or start a new run with another --policy.replay.root"
+
 ROUND = re.compile(r"round-(\d{5,})")
 
 
@@ -34,7 +36,7 @@ def examine_episodes(root: Path, rounds_used: int = 0) -> list[Finding]:
     try:
         _ = journal.header
     except ValueError as error:
-        return [Finding.of(Severity.BROKEN, AREA, error)]
+        return [Finding.of(Severity.BROKEN, AREA, error, ANOTHER)]
     numbers = _rounds(root)
     finished = [number for number in numbers if (journal.folder(number) / REPORT).exists()]
     findings = list(_order(journal, numbers, finished, rounds_used))
@@ -60,14 +62,13 @@ def _order(
     journal: EpisodeJournal, numbers: Sequence[int], finished: Sequence[int], rounds_used: int
 ) -> Iterator[Finding]:
     """Whether rounds are missing."""
-    another = "restore it, or start a new run with another --policy.replay.root"
     last = max(finished, default=-1)
     for number in range(last):
         if number not in numbers:
-            yield Finding(Severity.BROKEN, AREA, f"{journal.folder(number)} is missing", another)
+            yield Finding(Severity.BROKEN, AREA, f"{journal.folder(number)} is missing", ANOTHER)
         elif number not in finished:
             text = f"{journal.folder(number) / REPORT} is missing, and a later round is finished"
-            yield Finding(Severity.BROKEN, AREA, text, another)
+            yield Finding(Severity.BROKEN, AREA, text, ANOTHER)
     for number in numbers:
         if number > last:
             text = f"{journal.folder(number)} is not finished"

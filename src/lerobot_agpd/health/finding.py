@@ -37,11 +37,9 @@ class Finding:
 
     @classmethod
     def of(cls, severity: Severity, area: str, error: object, remedy: str = "") -> Finding:
-        """A finding in the words of an error, whose messages say after a semicolon what to do."""
-        text = " ".join(str(error).split())
-        if not remedy:
-            text, _, remedy = text.partition("; ")
-        return cls(severity, area, text, remedy)
+        """A finding in the words of an error, whose message says after a semicolon what to do; else `remedy`."""
+        text, _, advice = " ".join(str(error).split()).partition("; ")
+        return cls(severity, area, text, advice or remedy)
 
 
 def is_broken(findings: Iterable[Finding]) -> bool:

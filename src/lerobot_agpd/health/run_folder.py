@@ -28,6 +28,9 @@ def examine_run(run: Path) -> list[Finding]:
     replay = run / REPLAY_FOLDER
     recorded = counters.get("replay_root")
     if not replay.is_dir() and recorded and Path(recorded).is_dir():
+        text = f"{replay} is missing; the run goes on with the episodes in {recorded}"
+        remedy = "if that is another run's folder, as after copying one: copy its agpd folder, too"
+        findings.append(Finding(Severity.WARNING, "episodes", text, remedy))
         replay = Path(recorded)
     rounds_used = int(counters.get("rounds") or 0)
     if replay.is_dir():
@@ -108,4 +111,4 @@ def _has_nan(column: pa.ChunkedArray) -> bool:
     values = column.combine_chunks()
     while not pa.types.is_floating(values.type):
         values = values.flatten()
-    return not bool(np.isfinite(values.to_numpy(zero_copy_only=False)).all())
+    return not bool(np.isfinite(values.drop_null().to_numpy(zero_copy_only=False)).all())
