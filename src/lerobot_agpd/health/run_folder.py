@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 from lerobot.datasets.utils import DATA_DIR, DEFAULT_TASKS_PATH, EPISODES_DIR, INFO_PATH, STATS_PATH
 
 from lerobot_agpd.files import read_json
-from lerobot_agpd.health.checkpoints import examine_checkpoints
+from lerobot_agpd.health.checkpoints import Checkpoint, examine_checkpoints
 from lerobot_agpd.health.episodes import examine_episodes
 from lerobot_agpd.health.finding import Finding, Severity
 from lerobot_agpd.progress import REPLAY_FOLDER
@@ -25,13 +25,8 @@ def examine_run(run: Path) -> list[Finding]:
     """Findings about the output folder of a `lerobot-train` run: checkpoints, collected episodes, disk."""
     findings, checkpoint = examine_checkpoints(run)
     counters = checkpoint.counters if checkpoint else {}
-    replay = run / REPLAY_FOLDER
-    recorded = counters.get("replay_root")
-    if not replay.is_dir() and recorded and Path(recorded).is_dir():
-        text = f"{replay} is missing; the run goes on with the episodes in {recorded}"
-        remedy = "if that is another run's folder, as after copying one: copy its agpd folder, too"
-        findings.append(Finding(Severity.WARNING, "episodes", text, remedy))
-        replay = Path(recorded)
+    replay, found = _replay_folder(run, checkpoint)
+    findings += found
     rounds_used = int(counters.get("rounds") or 0)
     if replay.is_dir():
         findings += examine_episodes(replay, rounds_used)
@@ -43,6 +38,22 @@ def examine_run(run: Path) -> list[Finding]:
     if dataset and Path(dataset).is_dir():
         findings += examine_dataset(Path(dataset))
     return [*findings, *_disk(run)]
+
+
+def _replay_folder(run: Path, checkpoint: Checkpoint | None) -> tuple[Path, list[Finding]]:
+    """Folder of the collected episodes, looked for as a resumed run does, and a warning if it is not the run's own."""
+    own = run / REPLAY_FOLDER
+    if checkpoint is None:
+        return own, []
+    chosen = ((checkpoint.train_config.get("policy") or {}).get("replay") or {}).get("root")
+    if chosen:  # --policy.replay.root
+        return Path(chosen), []
+    recorded = checkpoint.counters.get("replay_root")
+    if own.is_dir() or not recorded or not Path(recorded).is_dir():
+        return own, []
+    text = f"{own} is missing; the run goes on with the episodes in {recorded}"
+    remedy = "if that is another run's folder, as after copying one: copy its agpd folder, too"
+    return Path(recorded), [Finding(Severity.WARNING, "episodes", text, remedy)]
 
 
 def _disk(folder: Path) -> Iterator[Finding]:
