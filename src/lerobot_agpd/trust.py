@@ -86,7 +86,7 @@ def load_processors(path: str | Path, config: PreTrainedConfig) -> Processors:
         if not Path(path).is_dir():
             revision = file.parent.name  # the commit: what is built below is what was checked
         for statistics in check_steps(file):
-            if statistics.exists():  # LeRobot fetches those of a Hub repository
+            if Path(path).is_dir() or statistics.exists():  # else LeRobot will fetch them from the Hub
                 stored_shapes(statistics, RESTORE)
     return make_pre_post_processors(
         config,

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_agpd.config import FlagError
+from lerobot_agpd.replay import stored
 
 
 def truncate(path: Path) -> None:
@@ -38,6 +39,7 @@ def test_one_line_with_path_and_remedy(start, name):
     run = start().train(until=7).save()
     path = sorted(run.agpd.run.output_dir.glob(pattern))[0]
     damage(path)
+    stored._memory_mapped.cache_clear()  # a resumed run is another process, which has opened nothing yet
     with pytest.raises((ValueError, FileNotFoundError, FlagError)) as stopped:
         start(run.checkpoint).train(until=8)
     message = str(stopped.value)
