@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -68,7 +69,8 @@ def _disk(folder: Path) -> Iterator[Finding]:
 def examine_dataset(root: Path) -> list[Finding]:
     """Findings about a LeRobotDataset on this machine: whether its files can be read, and agree."""
     area, remedy = "demonstrations", "restore the file, or record or download the dataset again"
-    findings, info = [], {}
+    findings: list[Finding] = []
+    info: dict[str, Any] = {}
     for name in (INFO_PATH, STATS_PATH):
         try:
             content = read_json(root / name)
