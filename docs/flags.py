@@ -21,6 +21,7 @@ from lerobot_agpd.cli import (
     compare,
     demos,
     diversity,
+    doctor,
     export,
     import_adroit,
     import_pusht,
@@ -46,6 +47,7 @@ COMMANDS = {
     "lerobot-agpd-report": report.ReportConfig,
     "lerobot-agpd-viz": viz.VizConfig,
     "lerobot-agpd-diversity": diversity.DiversityConfig,
+    "lerobot-agpd-doctor": doctor.DoctorConfig,
     "lerobot-agpd-merge": merge.MergeConfig,
     "lerobot-agpd-export": export.ExportConfig,
 }

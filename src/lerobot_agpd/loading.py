@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from draccus.utils import DraccusException
+from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.envs import EnvConfig
 from lerobot.envs.utils import env_to_policy_features
-from lerobot.policies import PreTrainedPolicy, get_policy_class, make_pre_post_processors
+from lerobot.policies import PreTrainedPolicy, get_policy_class
 from lerobot.processor import NormalizerProcessorStep, PolicyAction, PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_PREFIX
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_agpd.config import CollectConfig, FlagError, StudentConfig, TeacherConfig, require
+from lerobot_agpd.files import read_json
 from lerobot_agpd.guidance.adapters import as_teacher
 from lerobot_agpd.guidance.teacher import Features, Teacher
 from lerobot_agpd.replay.gate import not_finite_statistic
 from lerobot_agpd.replay.normalization import Normalizer
 from lerobot_agpd.run import RunInfo
 from lerobot_agpd.student import Student, StudentSampler
+from lerobot_agpd.trust import RESTORE, load_processors, require_known_policy, require_safetensors
 from lerobot_agpd.weights import not_finite_weight
 
 # ---- policies ----
@@ -39,17 +42,27 @@ class LoadedPolicy:
     postprocessor: PolicyProcessorPipeline[PolicyAction, PolicyAction]
 
 
-def read_policy_config(path: str | Path, flag: str) -> PreTrainedConfig:
+def read_policy_config(path: str | Path, flag: str, cli_overrides: Sequence[str] = ()) -> PreTrainedConfig:
     """Configuration of the checkpoint that a flag names.
+
+    Args:
+        path: checkpoint folder or Hub repository.
+        flag: the flag, for messages.
+        cli_overrides: arguments that replace settings of the checkpoint, such as `--n_action_steps=4`.
 
     Raises:
         FileNotFoundError: if there is no policy at the path.
         FlagError: if its configuration holds fields that this version does not have.
+        ValueError: if its config.json is damaged.
     """
     register_third_party_plugins()  # the type may be a plugin's, and only LeRobot's commands have done it by now
+    if (Path(path) / CONFIG_NAME).is_file():
+        read_json(Path(path) / CONFIG_NAME, f"it is what {flag} names; {RESTORE}")
     try:
-        config = PreTrainedConfig.from_pretrained(path)
+        config = PreTrainedConfig.from_pretrained(path, cli_overrides=list(cli_overrides))
     except DraccusException as error:
+        if isinstance(error, FlagError) and cli_overrides:
+            raise
         raise FlagError(
             f"{flag}='{path}': its config.json was written by another version of its policy's package ({error}); load it "
             "with that version, or remove from the file what this version does not have"
@@ -57,21 +70,32 @@ def read_policy_config(path: str | Path, flag: str) -> PreTrainedConfig:
     except Exception as error:
         raise FileNotFoundError(
             f"{flag}='{path}' is neither a folder with a policy's config.json nor a Hub repository that can be "
-            f"reached ({error})"
+            f"reached ({error}){_inside(path)}"
         ) from error
     config.pretrained_path = Path(path)
     return config
 
 
+def _inside(path: str | Path) -> str:
+    """A hint for those who name the folder of a run instead of one of its checkpoints."""
+    inner = ("checkpoints/last/pretrained_model", "last/pretrained_model", "pretrained_model")
+    found = next((Path(path) / part for part in inner if (Path(path) / part / CONFIG_NAME).is_file()), None)
+    return f"; did you mean '{found}'?" if found else ""
+
+
 def load_policy(config: PreTrainedConfig) -> LoadedPolicy:
-    """Load the checkpoint at `config.pretrained_path` on `config.device`, with the settings of `config`."""
+    """Load the checkpoint at `config.pretrained_path` on `config.device`, with the settings of `config`.
+
+    Raises:
+        FlagError: if loading it could run a program that it brings along, see `trust`.
+        ValueError: naming the file, if one is damaged.
+    """
     path = str(config.pretrained_path)
+    require_known_policy(config, path)
+    processors = load_processors(path, config)
+    if Path(path).is_dir():
+        require_safetensors(Path(path))
     policy = get_policy_class(config.type).from_pretrained(path, config=config)
-    processors = make_pre_post_processors(
-        config,
-        pretrained_path=path,
-        preprocessor_overrides={"device_processor": {"device": config.device}},
-    )
     return LoadedPolicy(policy.eval(), *processors)
 
 

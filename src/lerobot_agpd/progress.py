@@ -12,6 +12,7 @@ from typing import Any
 from accelerate.utils import broadcast_object_list
 
 from lerobot_agpd.config import StudentConfig
+from lerobot_agpd.files import read_json
 from lerobot_agpd.run import RunInfo
 
 logger = logging.getLogger(__name__)
@@ -44,7 +45,7 @@ class Progress:
 
         Raises:
             FileNotFoundError: if the checkpoint of a resumed run has none.
-            ValueError: if they were written by another version.
+            ValueError: if they are damaged or were written by another version.
         """
         return cls.read(config.pretrained_path) if run.resume and config.pretrained_path else cls()
 
@@ -57,7 +58,7 @@ class Progress:
                 f"{path} is missing, so this run cannot be resumed; start a new one from the checkpoint with "
                 "--policy.path instead"
             )
-        content: dict[str, Any] = json.loads(path.read_text())
+        content: dict[str, Any] = read_json(path, "continue from an earlier checkpoint (--config_path)")
         saved = {entry.name for entry in fields(cls)} - {"checkpoint"}
         if set(content) != saved:
             raise ValueError(

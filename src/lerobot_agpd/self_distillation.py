@@ -11,6 +11,7 @@ from lerobot_agpd.guidance.adapters import as_teacher
 from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.replay.normalization import Statistics
 from lerobot_agpd.student import Student
+from lerobot_agpd.weights import stored_shapes
 
 PREVIOUS_SELF = "previous_self.safetensors"
 
@@ -53,7 +54,12 @@ class SelfTeacher:
             save_file(weights, folder / PREVIOUS_SELF)
 
     def restore(self, folder: Path) -> None:
-        """Read what `save` wrote; without it (no round was collected yet) there is no previous self."""
+        """Read what `save` wrote; without it (no round was collected yet) there is no previous self.
+
+        Raises:
+            ValueError: if the file is damaged.
+        """
         if (folder / PREVIOUS_SELF).is_file():
+            stored_shapes(folder / PREVIOUS_SELF, "continue from an earlier checkpoint (--config_path)")
             self._newest = self.student.snapshot()
             self._newest.load_state_dict(load_file(folder / PREVIOUS_SELF))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 from safetensors import SafetensorError, safe_open
 from torch import nn
@@ -19,13 +21,7 @@ def require_weights(model: nn.Module, file: str, optional: tuple[str, ...] = ())
     Raises:
         ValueError: if the file is unreadable, lacks weights, or holds some of another shape.
     """
-    try:
-        with safe_open(file, framework="pt") as weights:
-            stored = {key: tuple(weights.get_slice(key).get_shape()) for key in weights.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise ValueError(
-            f"{file} cannot be read as a safetensors file ({error}); is the checkpoint complete?"
-        ) from error
+    stored = stored_shapes(file, "is the checkpoint complete?")
     expected = {key: tuple(value.shape) for key, value in model.state_dict().items()}
     missing = sorted(key for key in expected if key not in stored and key.split(".")[0] not in optional)
     wrong = sorted(
@@ -38,6 +34,19 @@ def require_weights(model: nn.Module, file: str, optional: tuple[str, ...] = ())
             f"{file} does not fit the policy that its config.json describes; missing: {missing[:5]} "
             f"({len(missing)} in all), of another shape: {wrong[:5]} ({len(wrong)} in all)"
         )
+
+
+def stored_shapes(file: str | Path, remedy: str) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of the tensors in a .safetensors file, of which only the header is read.
+
+    Raises:
+        ValueError: naming the file if it is missing, damaged or truncated, with `remedy`: what to do then.
+    """
+    try:
+        with safe_open(file, framework="pt") as tensors:
+            return {key: tuple(tensors.get_slice(key).get_shape()) for key in tensors.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"{file} cannot be read as a safetensors file ({error}); {remedy}") from error
 
 
 def not_finite_weight(model: nn.Module) -> str | None:

@@ -12,6 +12,7 @@ PARSED = {
     "import_adroit": (["--source=nowhere", "--root=x"], "--source=nowhere"),
     "import_pusht": (["--source=nowhere", "--root=x"], "--source=nowhere"),
     "import_robomimic": (["nowhere.hdf5", "--root=x"], "--source=nowhere.hdf5"),
+    "doctor": (["--run=nowhere"], "--run=nowhere is not a folder"),
     "merge": (["--root=nowhere"], "--root=nowhere is not a folder"),
     "probe": (["--output=x"], "--teacher.path is not set"),
     "report": (["--env.type=pusht", "--output=x", "--episodes=1", "--policies={a: .}"], "--episodes must be"),

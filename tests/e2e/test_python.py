@@ -15,6 +15,8 @@ from lerobot.scripts.lerobot_train import train
 
 from lerobot_agpd.config import CollectConfig, TeacherConfig
 from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
+from lerobot_agpd.health.finding import Severity
+from lerobot_agpd.health.run_folder import examine_run
 from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig
 
 pytestmark = pytest.mark.slow
@@ -54,6 +56,13 @@ def test_the_example_distills(example: Path) -> None:
     environment = {"type": "gymnasium_robotics", "task": "FetchReach-v4"}
     assert header(output)["identity"]["environment"] == environment
     assert not (example / "elsewhere").exists()
+
+
+def test_a_finished_run_is_healthy(example: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(example)  # the configuration holds relative paths
+    findings = examine_run(Path("outputs/fetchreach/student"))
+    assert {finding.severity for finding in findings} == {Severity.OK}
+    assert {finding.area for finding in findings} >= {"checkpoints", "continue", "episodes", "demonstrations"}
 
 
 def test_episodes_go_to_lerobots_default_folder(

@@ -8,7 +8,6 @@ from argparse import ArgumentError
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import wraps
-from pathlib import Path
 from typing import get_type_hints
 
 import draccus
@@ -19,7 +18,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
 from lerobot_agpd.config import StudentConfig, TeacherConfig
-from lerobot_agpd.loading import require_student
+from lerobot_agpd.loading import read_policy_config, require_student
 from lerobot_agpd.studies.parsing import load_plugins, reason
 
 logger = logging.getLogger(__name__)
@@ -95,8 +94,7 @@ class StudentFlags:
         path = parser.get_path_arg("policy")
         if path:
             overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
-            self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
-            self.policy.pretrained_path = Path(path)
+            self.policy = read_policy_config(path, "--policy.path", overrides)
         require_student(self.policy)
 
     @classmethod

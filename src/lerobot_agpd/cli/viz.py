@@ -176,7 +176,8 @@ def main(config: VizConfig) -> None:
     if config.png is not None:
         logger.info("still picture in %s", config.png)
     if config.open:  # in a process of its own, which outlives this one
-        subprocess.Popen([sys.executable, "-m", "rerun", str(config.output)], start_new_session=True)
+        command = [sys.executable, "-m", "rerun", str(config.output)]
+        subprocess.Popen(command, start_new_session=True)  # noqa: S603  # no shell, this interpreter
 
 
 if __name__ == "__main__":

@@ -12,12 +12,12 @@ from typing import Any
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.lerobot_types import TransitionKey
-from lerobot.policies import make_pre_post_processors
 from lerobot.processor import NormalizerProcessorStep, UnnormalizerProcessorStep
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_agpd.config import StudentConfig
+from lerobot_agpd.trust import load_processors
 
 logger = logging.getLogger(__name__)
 
@@ -143,11 +143,7 @@ class Normalizer:
 
 def saved_statistics(pretrained_path: Path | str, config: PreTrainedConfig) -> Statistics | None:
     """Statistics stored with a checkpoint's preprocessor, or None where it has no normalizer."""
-    preprocessor, _ = make_pre_post_processors(
-        config,
-        pretrained_path=str(pretrained_path),
-        preprocessor_overrides={"device_processor": {"device": config.device}},
-    )
+    preprocessor, _ = load_processors(pretrained_path, config)
     for step in preprocessor.steps:
         if isinstance(step, NormalizerProcessorStep):
             return step.stats

@@ -69,7 +69,7 @@ class Processes:
         """Run a command; it holds the lock too, so that the folder stays locked if this process is killed."""
         with (
             log.open("ab") as out,
-            subprocess.Popen(
+            subprocess.Popen(  # noqa: S603  # no shell; the commands are those of the user's matrix
                 command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=self.env, pass_fds=[lock]
             ) as process,
         ):

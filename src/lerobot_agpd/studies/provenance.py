@@ -81,7 +81,8 @@ def _sha256(path: Path) -> str | None:
 def _commit(file: Path) -> dict[str, Any] | None:
     def git(*args: str) -> str:
         command = ["git", "-C", str(file.parent), *args]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+        done = subprocess.run(command, capture_output=True, text=True, check=True)  # noqa: S603  # no shell
+        return done.stdout.strip()
 
     try:
         git("ls-files", "--error-unmatch", file.name)  # an installed copy may lie inside another repository

@@ -1,0 +1,1 @@
+"""What `lerobot-agpd-doctor` looks at: the installation, and the folder of a run."""
