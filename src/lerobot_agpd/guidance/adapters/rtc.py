@@ -18,6 +18,7 @@ from torch import Tensor
 from lerobot_agpd.config import GuidancePoint, require
 from lerobot_agpd.guidance.flow import guided_velocity
 from lerobot_agpd.guidance.guide import Guide
+from lerobot_agpd.guidance.pull import Sampler, flow_sampler
 from lerobot_agpd.guidance.teacher import Features, Teacher
 
 EMPTY_CAMERA = "empty_camera"
@@ -65,14 +66,21 @@ class RTCTeacher(Teacher):
         """Where J can be differentiated: a flow has no posterior mean."""
         return ("x0",)
 
+    @property
+    def sampler(self) -> Sampler:
+        """The Euler steps of its flow."""
+        return flow_sampler(getattr(self.policy.config, self._steps_field))
+
+    @property
+    def _steps_field(self) -> str:
+        return "num_steps" if hasattr(self.policy.config, "num_steps") else "num_inference_steps"
+
     def set_sampler(self, num_inference_steps: int | None, noise_scheduler: str | None) -> None:
         """Exchange the number of Euler steps."""
         if noise_scheduler is not None:
             raise self.no_such_setting("noise_scheduler", noise_scheduler, "integrates a flow")
         if num_inference_steps is not None:
-            config = self.policy.config
-            field = "num_steps" if hasattr(config, "num_steps") else "num_inference_steps"
-            setattr(config, field, num_inference_steps)
+            setattr(self.policy.config, self._steps_field, num_inference_steps)
 
     def _sample_chunk(
         self, batch: dict[str, Tensor], guide: Guide | None, generator: torch.Generator | None
