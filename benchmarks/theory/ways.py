@@ -172,7 +172,7 @@ def draw(result: dict, path: Path) -> None:
         title=f"b  after {ROUNDS} rounds of {EPISODES} episodes",
         xlabel="coupling $\\kappa$ = k' distance$^2$ / 2",
         ylabel="share of the leading way",
-        ylim=(0.2, 1.03),
+        ylim=(-0.02, 1.03),
     )
     middle.legend(frameon=False, fontsize=8, loc="lower right")
 
