@@ -135,10 +135,10 @@ def next_strength(
         config: upper limit; a first strength beyond a limit only ever moves back toward it.
         reachable: the largest strength that the teacher's sampler can follow.
     """
-    known = guided_success is not None and teacher_success is not None
-    if not config.adaptive or not known or config.first_strength == 0:
+    if guided_success is None or teacher_success is None:
         return strength
-    assert guided_success is not None and teacher_success is not None
+    if not config.adaptive or config.first_strength == 0:
+        return strength
     if guided_success >= teacher_success - TOLERANCE:
         return max(strength, min(strength * GROWTH, config.max_strength, reachable))
     return min(strength, max(strength / GROWTH, MIN_STRENGTH))
@@ -253,14 +253,14 @@ class AGPD:
 
     def _report(self, number: int, strength: float, strategy: Strategy) -> RoundReport:
         assert self.collector is not None and self.journal is not None and self.teacher is not None
-        guides, guidance = self.config.collect.guides and strength > 0, self.config.guidance
+        guides = self.config.collect.guides and strength > 0
         report = RoundReport.of(
             self.journal.records(number),
             round=number,
             step=self.progress.step,
             strength=strength,
             next_strength=self.strength,
-            guidance_scale=guidance_scale(self.teacher, strength, guidance) if guides else None,
+            guidance_scale=guidance_scale(self.teacher, strength, self.config.guidance) if guides else None,
             seconds=dict(strategy.stopwatch.seconds),
             diagnostics=self.collector.diagnose(number, strength, strategy),
         )

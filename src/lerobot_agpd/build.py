@@ -275,16 +275,12 @@ def _check_strength(
     demonstrations: DemonstrationFrames,
 ) -> None:
     """Refuse a first round that guides more strongly than the teacher's denoising steps can follow."""
-    if not config.needs_guidance:
-        return
-    steps_flag = STEPS_FLAG
+    guidance, steps_flag = config.guidance, STEPS_FLAG
     if self_teacher is not None:
-        teacher, steps_flag = (
-            self_teacher.unchanged(demonstrations.normalizer.stats),
-            "--policy.num_inference_steps",
-        )
-    assert teacher is not None
-    require_strength(teacher, config.guidance.first_strength, config.guidance, steps_flag)
+        teacher = self_teacher.unchanged(demonstrations.normalizer.stats)
+        steps_flag = "--policy.num_inference_steps"
+    if config.needs_guidance and teacher is not None:
+        require_strength(teacher, guidance.first_strength, guidance, steps_flag)
 
 
 def _warn_of_settings(config: StudentConfig) -> None:
