@@ -236,7 +236,7 @@ def test_episodes_of_another_run_are_not_adopted(build, guided_config, tmp_path)
 
 
 OTHER_EPISODES = [
-    ({"guidance": GuidanceConfig(at="mu")}, "guidance.at 'x0' instead of 'mu'"),
+    ({"guidance": GuidanceConfig(pull=0.3, at="mu")}, "guidance.at 'x0' instead of 'mu'"),
     ({"collect": collect(min_reward=0.5)}, "collect.min_reward None instead of 0.5"),
     ({"collect": collect(keep_failures=True)}, "collect.keep_failures False instead of True"),
     ({"collect": collect(n_action_steps=2)}, "collect.n_action_steps None instead of 2"),
@@ -253,8 +253,8 @@ def test_episodes_made_with_other_settings_are_not_adopted(build, guided_config,
 def test_episodes_of_another_sampler_are_not_adopted(build, guided_config):
     config = guided_config()
     build(config)
-    config.teacher.num_inference_steps = 3
-    with pytest.raises(ValueError, match="teacher.num_inference_steps None instead of 3"):
+    config.teacher.num_inference_steps = 7
+    with pytest.raises(ValueError, match="teacher.num_inference_steps None instead of 7"):
         build(config)
 
 

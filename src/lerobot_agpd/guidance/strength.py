@@ -43,6 +43,8 @@ def require_strength(
         f"in every step of this {teacher.type} teacher; take 5 steps or more, or let it act alone "
         "(--policy.collect.strategy=teacher)",
     )
+    if config.unit == "scale":
+        return
     largest = largest_strength(teacher, config)
     require(
         strength <= largest,
