@@ -99,7 +99,7 @@ def build_parts(
     collector, journal = None, None
     if env_config is not None:
         _check_steps(student, teacher, demonstrations)
-        _check_strength(config, teacher, self_teacher, demonstrations)
+        _check_strength(config, teacher, self_teacher, meta.stats or {})
         _warn_of_settings(config)
         journal = _journal(config, run, progress, meta, env_config, seed)
         check = partial(check_observation, meta.features)
@@ -272,12 +272,12 @@ def _check_strength(
     config: StudentConfig,
     teacher: Teacher | None,
     self_teacher: SelfTeacher | None,
-    demonstrations: DemonstrationFrames,
+    stats: Statistics,
 ) -> None:
     """Refuse a first round that guides more strongly than the teacher's denoising steps can follow."""
     guidance, steps_flag = config.guidance, STEPS_FLAG
     if self_teacher is not None:
-        teacher = self_teacher.unchanged(demonstrations.normalizer.stats)
+        teacher = self_teacher.unchanged(stats)
         steps_flag = "--policy.num_inference_steps"
     if config.needs_guidance and teacher is not None:
         require_strength(teacher, guidance.first_strength, guidance, steps_flag)
