@@ -27,8 +27,13 @@ RENAMED_VALUES = {
 
 
 def flags(old: Mapping[str, Any]) -> Json:
-    """Dotted flags under today's names; groups that are constants now keep theirs, and no longer exist."""
+    """Dotted flags under today's names; groups that are constants now keep theirs, and no longer exist.
+
+    Runs that say nothing of guidance had its former default, a scale of 0.5.
+    """
     renamed = {RENAMED_FLAGS.get(name, name): value for name, value in old.items()}
+    if "policy.path" not in renamed and "policy.guidance.pull" not in renamed:
+        renamed.setdefault("policy.guidance.scale", 0.5)
     return {
         name: RENAMED_VALUES.get((name, value), value) if isinstance(value, str) else value
         for name, value in renamed.items()
@@ -48,13 +53,13 @@ def tally(old: Mapping[str, int]) -> Json:
 def round_report(old: Mapping[str, Any]) -> Json:
     """The report of a collection round, without its episodes."""
     if "total" in old:
-        return dict(old)
+        return {"next_strength" if key == "next_scale" else key: value for key, value in old.items()}
     nothing = {"generated": 0, "trivial": 0, "successful": 0, "kept": 0}
     diagnostics = old.get("diagnostics")
     return {
         "round": old["round"],
         "strength": old["scale"],
-        "next_scale": old["next_scale"],
+        "next_strength": old["next_scale"],
         "step": old["updates"],
         "total": tally({key: old[key] for key in nothing}),
         "strategy": tally(old["guided"]),

@@ -49,7 +49,7 @@ def agpd_diffusion_config(input_features, output_features):
     )
 
     def build(**options):
-        sizes = {"horizon": 8, "n_action_steps": 4, "drop_n_last_frames": 3, "num_inference_steps": 4}
+        sizes = {"horizon": 8, "n_action_steps": 4, "drop_n_last_frames": 3, "num_inference_steps": 10}
         network = {"denoiser": "mlp", "mlp": MLPDenoiserConfig(width=16, n_blocks=1)}
         features = {"input_features": dict(input_features), "output_features": dict(output_features)}
         common = {"noise_scheduler_type": "DDIM", "device": "cpu", "push_to_hub": False}

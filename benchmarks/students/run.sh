@@ -10,7 +10,7 @@ few=${2:-$output/fetchpush20} many=${3:-$output/fetchpush300}
 export HF_HUB_OFFLINE=1 OMP_NUM_THREADS=${OMP_NUM_THREADS:-1} MUJOCO_GL=${MUJOCO_GL:-egl}
 env=(--env.type=gymnasium_robotics --env.task=FetchPush-v4)
 rounds=(--policy.collect.warmup=500 --policy.collect.every=600 --policy.collect.rounds=5 --policy.collect.episodes=50
-    --policy.collect.n_envs=25)
+    --policy.collect.n_envs=25 --policy.guidance.scale=0.5)
 alone=(--policy.collect.every=0 --policy.adversary.weight=0)
 mkdir -p "$output"
 [ -d "$few" ] || lerobot-agpd-demos "${env[@]}" --episodes=20 --seed=5000 --root="$few"

@@ -5,7 +5,7 @@
         stage 1   A_hat = pi_phi(O)                             Eq. 19      GuidedStrategy.act
                   A ~ teacher, its denoising pulled to A_hat    Eq. 20      GuidedStrategy.act
                   execute A, keep what succeeds: T += episode               AGPD.collect_round
-                  adapt the guidance scale                                  next_scale
+                  adapt the pull                                            next_strength
     every training step
         stage 2   minimize L_IL + s * L_AIL on T                Eq. 21-22   AGPD.losses
                   predict O_{t+n} from O_t and A                A.4         AGPD.losses
@@ -16,7 +16,7 @@
 | pi_phi                 | student: what is needed of it is in student.py                                             |
 | A_hat                  | chunk_hat, (B, S, A), the student's chunk                                                  |
 | J, F_measure           | discrepancy, (B,), between a chunk of the teacher and A_hat (guidance/discrepancy.py)      |
-| k                      | guidance scale; `strength` of an episode, at 0 the teacher acts alone                      |
+| k                      | guidance scale, from the `strength` of an episode: its pull (guidance/pull.py); 0: teacher  |
 | D_w, s                 | discriminator, adversary.weight (adversary.py)                                             |
 | E, D of A.4            | representation (guidance/representation.py)                                                |
 | T                      | replay, in memory (replay/replay.py); journal, on disk (replay/journal.py)                 |
@@ -41,6 +41,7 @@ from lerobot_agpd.build import Parts
 from lerobot_agpd.config import CollectConfig, GuidanceConfig, StudentConfig
 from lerobot_agpd.guidance.guide import Guide
 from lerobot_agpd.guidance.representation import WEIGHT, reconstruction_loss
+from lerobot_agpd.guidance.strength import guidance_scale, guidance_scales, largest_strength
 from lerobot_agpd.guidance.teacher import History
 from lerobot_agpd.guidance.teacher_student import TeacherStudent
 from lerobot_agpd.replay.demonstrations import Batch
@@ -60,13 +61,13 @@ from lerobot_agpd.rollout.success import classify
 from lerobot_agpd.student import PriorChunk, Student, StudentSampler
 
 GROWTH = 2.0
-"""Factor by which the guidance scale grows after a good round and shrinks after a bad one."""
+"""Factor by which the strength of guidance grows after a good round and shrinks after a bad one."""
 
 TOLERANCE = 0.05
 """How far the guided teacher's success rate may fall below its own in a good round."""
 
-MIN_SCALE = 0.05
-"""An adapted guidance scale never falls below this."""
+MIN_STRENGTH = 0.05
+"""An adapted strength, be it a pull or a guidance scale, never falls below this."""
 
 ADVERSARY_LOG = ("discriminator_loss", "adversarial_loss", "discriminator_accuracy")
 
@@ -82,13 +83,14 @@ class GuidedStrategy(Strategy):
         self.config = config
 
     def act(self, history: History, strength: Tensor, student_acts: Tensor | None = None) -> ChunkBatch:
-        """Guided chunks; `strength` is the guidance scale, rows at 0 are the teacher's own bit for bit."""
+        """Guided chunks; `strength` is the pull (or scale), rows at 0 are the teacher's own bit for bit."""
         chunk_hat = self.pair.propose(history)  # A_hat = pi_phi(O), Eq. 19: (B, S, A), student-normalized
         action_j = self.pair.action_discrepancy(chunk_hat)
         guide = None
         if bool((strength > 0).any()):  # else the teacher need not be one that can be guided
             discrepancy = self.pair.guiding_discrepancy(history, chunk_hat, action_j)  # J(., A_hat)
-            guide = Guide(discrepancy, strength.to(chunk_hat.device), at=self.config.at)
+            scale = guidance_scales(self.pair.teacher, strength, self.config)  # k
+            guide = Guide(discrepancy, scale.to(chunk_hat.device), at=self.config.at)
         actions = self.pair.teacher_actions(history, self.generator, guide)  # Eq. 20: (B, n, A), raw
         shift = unknown(actions).to(chunk_hat.device)
         if guide is not None and guide.shift_in_sigmas:
@@ -113,26 +115,33 @@ def make_strategy(config: StudentConfig, pair: TeacherStudent, generator: torch.
     return RollInStrategy(guided) if config.collect.strategy == "rollin" else guided
 
 
-def next_scale(
-    scale: float, guided_success: float | None, teacher_success: float | None, config: GuidanceConfig
+def next_strength(
+    strength: float,
+    guided_success: float | None,
+    teacher_success: float | None,
+    config: GuidanceConfig,
+    reachable: float = math.inf,
 ) -> float:
-    """Guidance scale of the next round: the "adaptive" in AGPD.
+    """Pull (or guidance scale) of the next round: the "adaptive" in AGPD.
 
-    A round is good if guided episodes succeed as often as the teacher's own, up to TOLERANCE; then the scale grows
-    by GROWTH, else it shrinks by the same factor. While the student is weak its pull costs success and the scale
-    stays small; as the student improves the scale rises.
+    A round is good if guided episodes succeed as often as the teacher's own, up to TOLERANCE; then the strength grows
+    by GROWTH, else it shrinks by the same factor. While the student is weak its pull costs success and the strength
+    stays small; as the student improves the strength rises.
 
     Args:
-        scale: of the finished round.
+        strength: of the finished round.
         guided_success: success rate of its guided episodes, None if there were none.
         teacher_success: success rate of the teacher alone, None if unknown.
-        config: upper limit; a first scale beyond a limit only ever moves back toward it.
+        config: upper limit; a first strength beyond a limit only ever moves back toward it.
+        reachable: the largest strength that the teacher's sampler can follow.
     """
-    if not config.adaptive or guided_success is None or teacher_success is None or config.scale == 0:
-        return scale
+    if guided_success is None or teacher_success is None:
+        return strength
+    if not config.adaptive or config.first_strength == 0:
+        return strength
     if guided_success >= teacher_success - TOLERANCE:
-        return max(scale, min(scale * GROWTH, config.max_scale))
-    return min(scale, max(scale / GROWTH, MIN_SCALE))
+        return max(strength, min(strength * GROWTH, config.max_strength, reachable))
+    return min(strength, max(strength / GROWTH, MIN_STRENGTH))
 
 
 def rounds_due(step: int, config: CollectConfig) -> int:
@@ -193,9 +202,9 @@ class AGPD:
     # ---- stage 1 ----
 
     @property
-    def scale(self) -> float:
-        """Guidance scale of the next round."""
-        return self.reports[-1].next_scale if self.reports else self.config.guidance.scale
+    def strength(self) -> float:
+        """Pull (or guidance scale) of the next round's guided episodes."""
+        return self.reports[-1].next_strength if self.reports else self.config.guidance.first_strength
 
     def collect_round(self) -> RoundReport:
         """One round: every process rolls out its part, successes become part of T."""
@@ -204,7 +213,7 @@ class AGPD:
         self.student.eval()
         with seeded_context(self.collector.stream_seed(number, STUDENT_NOISE_STREAM)):
             strategy = self._strategy(number)
-            strength = self._strength()
+            strength = self._episode_strength()
             done = {record.number for record in self.journal.records(number, self.rank)}
             for episode in self.collector.roll_out(number, strength, strategy, done):  # execute
                 with strategy.stopwatch.measure("writing"):
@@ -235,34 +244,38 @@ class AGPD:
         pair = StudentSampler(self.student, normalizer, acting).pair_with(self.teacher)
         return make_strategy(self.config, pair, self.collector.noise(number))
 
-    def _strength(self) -> float:
-        """Guidance scale, mixing weight or number of samples of a round's episodes; 0: the teacher alone."""
+    def _episode_strength(self) -> float:
+        """Pull (or scale), mixing weight or number of samples of a round's episodes; 0: the teacher alone."""
         collect = self.config.collect
         strengths = {"mixing": collect.mixing.weight, "nearest": collect.nearest_samples, "teacher": 0.0}
         has_target = self.self_teacher is None or self.self_teacher.previous is not None
-        return float(strengths.get(collect.strategy, self.scale)) if has_target else 0.0
+        return float(strengths.get(collect.strategy, self.strength)) if has_target else 0.0
 
     def _report(self, number: int, strength: float, strategy: Strategy) -> RoundReport:
-        assert self.collector is not None and self.journal is not None
+        assert self.collector is not None and self.journal is not None and self.teacher is not None
+        guides = self.config.collect.guides and strength > 0
         report = RoundReport.of(
             self.journal.records(number),
             round=number,
             step=self.progress.step,
             strength=strength,
-            next_scale=self.scale,
+            next_strength=self.strength,
+            guidance_scale=guidance_scale(self.teacher, strength, self.config.guidance) if guides else None,
             seconds=dict(strategy.stopwatch.seconds),
             diagnostics=self.collector.diagnose(number, strength, strategy),
         )
-        return (
-            replace(report, next_scale=self._adapted_scale(report)) if self.config.collect.guides else report
-        )
+        if not self.config.collect.guides:
+            return report
+        return replace(report, next_strength=self._adapted_strength(report))
 
-    def _adapted_scale(self, report: RoundReport) -> float:
+    def _adapted_strength(self, report: RoundReport) -> float:
         # A frozen teacher's own rate is best known from all rounds; one that still learns has only its newest.
         rounds = [report] if self.self_teacher else [*self.reports, report]
         guided_success = success_rate([report.strategy])
         teacher_success = success_rate(entry.teacher_only for entry in rounds)
-        return next_scale(self.scale, guided_success, teacher_success, self.config.guidance)
+        assert self.teacher is not None
+        reachable = largest_strength(self.teacher, self.config.guidance)
+        return next_strength(self.strength, guided_success, teacher_success, self.config.guidance, reachable)
 
     # ---- stage 2 ----
 

@@ -11,6 +11,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.envs import EnvConfig
 
 from lerobot_agpd.config import StudentConfig, require
+from lerobot_agpd.guidance.strength import STEPS_FLAG, require_strength
 from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.loading import check_fit, collection_environment, load_teacher
 from lerobot_agpd.progress import Progress, find_replay_root
@@ -98,6 +99,7 @@ def build_parts(
     collector, journal = None, None
     if env_config is not None:
         _check_steps(student, teacher, demonstrations)
+        _check_strength(config, teacher, self_teacher, meta.stats or {})
         _warn_of_settings(config)
         journal = _journal(config, run, progress, meta, env_config, seed)
         check = partial(check_observation, meta.features)
@@ -214,6 +216,7 @@ def _identity(config: StudentConfig, env_config: EnvConfig, seed: int) -> dict[s
     }
     if collect.guides:
         identity["guidance.at"] = config.guidance.at
+        identity["guidance.strength"] = config.guidance.unit
     if collect.strategy == "mixing":
         identity["collect.mixing"] = asdict(collect.mixing)
     if collect.strategy == "nearest":
@@ -265,17 +268,33 @@ def _check_steps(student: Student, teacher: Teacher | None, demonstrations: Demo
     )
 
 
+def _check_strength(
+    config: StudentConfig,
+    teacher: Teacher | None,
+    self_teacher: SelfTeacher | None,
+    stats: Statistics,
+) -> None:
+    """Refuse a first round that guides more strongly than the teacher's denoising steps can follow."""
+    guidance, steps_flag = config.guidance, STEPS_FLAG
+    if self_teacher is not None:
+        teacher = self_teacher.unchanged(stats)
+        steps_flag = "--policy.num_inference_steps"
+    if config.needs_guidance and teacher is not None:
+        require_strength(teacher, guidance.first_strength, guidance, steps_flag)
+
+
 def _warn_of_settings(config: StudentConfig) -> None:
     """Warn of settings that are allowed and seldom intended."""
     collect = config.collect
-    adapts = config.guidance.adaptive and config.guidance.scale > 0 and config.needs_guidance
+    adapts = config.guidance.adaptive and config.guidance.first_strength > 0 and config.needs_guidance
     if adapts and int(collect.episodes * collect.teacher_only_fraction) == 0:
         logger.warning(
             "--policy.collect.teacher_only_fraction=%s of --policy.collect.episodes=%d is less than one episode: the "
-            "teacher's own success rate stays unknown and the guidance scale at %s",
+            "teacher's own success rate stays unknown and the %s of guidance at %s",
             collect.teacher_only_fraction,
             collect.episodes,
-            config.guidance.scale,
+            config.guidance.unit,
+            config.guidance.first_strength,
         )
     teacher_recorded = collect.strategy == "mixing" and collect.mixing.record_teacher
     if collect.keep_failures and config.replay.relabel != "all" and not teacher_recorded:

@@ -21,6 +21,9 @@ from lerobot.envs import EnvConfig
 EVALUATION_SEEDS = (100_000, 1_000_000)
 """Environment seeds left to final evaluations; LeRobot's own evaluation during training counts up from --seed."""
 
+DEFAULT_PULL = 0.6
+"""Pull of the first round (docs/method.md says why)."""
+
 COLLECTION_SEEDS = (1_000_000, 2**31 - 1)
 """Environment seeds that collection draws from."""
 
@@ -28,6 +31,7 @@ COLLECTION_SEEDS = (1_000_000, 2**31 - 1)
 # Named, not spelled out at the fields: the flag parser finds a field's comment only if its annotation is plain words.
 NoiseScheduler = Literal["DDPM", "DDIM"]
 GuidancePoint = Literal["x0", "mu"]
+StrengthUnit = Literal["pull", "scale"]
 RepresentationType = Literal["action", "state"]
 StrategyName = Literal["guided", "nearest", "teacher", "mixing", "rollin"]
 MixingForm = Literal["interpolate", "switch"]
@@ -101,19 +105,55 @@ class TeacherConfig:
 class GuidanceConfig:
     """How strongly, and where, the teacher's denoising is pulled toward the student (Eq. 20)."""
 
-    # Guidance scale k of the first round; positive pulls toward the student, 0 switches guidance off.
-    scale: float = 0.5
+    # Pull of the first round: how far a chunk goes toward the student, from 0 (guidance off) to 1. The guidance scale is
+    # computed from it for the teacher's own sampler (guidance/pull.py). Default: 0.6, unless guidance.scale is given.
+    pull: float | None = None
+    # Instead of a pull: guidance scale k of the first round (Eq. 20), which pulls differently with every sampler; positive
+    # is toward the student.
+    scale: float | None = None
     # Where J is differentiated: predicted clean chunk, or posterior mean as printed (flows have none).
     at: GuidancePoint = "x0"
-    # Adapt the scale from round to round to keep the teacher's success rate.
+    # Adapt the pull (or scale) from round to round to keep the teacher's success rate.
     adaptive: bool = True
-    # The adapted scale never exceeds this; beyond, strided DDIM carries x0 past the student.
+    # The adapted pull never exceeds this.
+    max_pull: float = 1.0
+    # The adapted scale never exceeds this (where guidance.scale is given).
     max_scale: float = 2.0
 
     def __post_init__(self) -> None:
         require_finite(self, "guidance")
-        require(self.scale >= 0, f"--policy.guidance.scale must not be negative, got {self.scale}")
+        require(
+            self.pull is None or self.scale is None,
+            f"--policy.guidance.pull={self.pull} and --policy.guidance.scale={self.scale} exclude each other: both say how "
+            "strongly guidance acts; give one of them",
+        )
+        require(
+            self.pull is None or 0 <= self.pull <= 1,
+            f"--policy.guidance.pull must be in [0, 1], got {self.pull}",
+        )
+        require(
+            self.scale is None or self.scale >= 0,
+            f"--policy.guidance.scale must not be negative, got {self.scale}",
+        )
+        require(0 < self.max_pull <= 1, f"--policy.guidance.max_pull must be in (0, 1], got {self.max_pull}")
         require(self.max_scale > 0, f"--policy.guidance.max_scale must be positive, got {self.max_scale}")
+
+    @property
+    def unit(self) -> StrengthUnit:
+        """What the strength of a guided episode is: a pull, or a guidance scale."""
+        return "pull" if self.scale is None else "scale"
+
+    @property
+    def first_strength(self) -> float:
+        """Strength of the first round, in `unit`."""
+        if self.scale is not None:
+            return self.scale
+        return DEFAULT_PULL if self.pull is None else self.pull
+
+    @property
+    def max_strength(self) -> float:
+        """Upper limit of an adapted strength, in `unit`."""
+        return self.max_pull if self.scale is None else self.max_scale
 
 
 @dataclass
@@ -223,7 +263,7 @@ class CollectConfig:
 
     @property
     def guides(self) -> bool:
-        """Whether the teacher is guided, and its scale adapted from round to round."""
+        """Whether the teacher is guided, and the strength adapted from round to round."""
         return self.strategy in ("guided", "rollin")
 
 
@@ -318,9 +358,9 @@ class StudentConfig(PreTrainedConfig):
 
     @property
     def needs_guidance(self) -> bool:
-        """Whether the teacher must be one that can be guided; roll-in with a scale of 0 leaves it alone."""
+        """Whether the teacher must be one that can be guided; roll-in with a strength of 0 leaves it alone."""
         strategy = self.collect.strategy
-        return strategy == "guided" or (strategy == "rollin" and self.guidance.scale > 0)
+        return strategy == "guided" or (strategy == "rollin" and self.guidance.first_strength > 0)
 
     @property
     def needs_teacher_chunks(self) -> bool:

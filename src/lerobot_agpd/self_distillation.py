@@ -42,10 +42,17 @@ class SelfTeacher:
         """
         self.previous = self._newest
         self._newest = self.student.snapshot()
+        return self._as_teacher(self._newest, stats)
+
+    def unchanged(self, stats: Statistics) -> Teacher:
+        """The student as it is now as a teacher, without a snapshot: how it samples is known before training."""
+        return self._as_teacher(self.student, stats)
+
+    def _as_teacher(self, policy: PreTrainedPolicy, stats: Statistics) -> Teacher:
         processors = make_pre_post_processors(
             self.student.config, dataset_stats={key: dict(entry) for key, entry in stats.items()}
         )
-        return as_teacher(self._newest, *processors)
+        return as_teacher(policy, *processors)
 
     def save(self, folder: Path) -> None:
         """Write the newest snapshot beside a checkpoint: it is the previous self of the next round."""

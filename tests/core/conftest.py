@@ -45,7 +45,7 @@ def save_teacher(save_policy, input_features, output_features):
             input_features=inputs or dict(input_features),
             output_features=outputs or dict(output_features),
             mlp=MLPDenoiserConfig(width=8, n_blocks=1),
-            num_inference_steps=2,
+            num_inference_steps=5,
             noise_scheduler_type="DDIM",
             device="cpu",
             push_to_hub=False,

@@ -53,7 +53,7 @@ def test_the_alternation(start, toy_teacher):
     run.train(until=STEPS)
     assert [report.step for report in agpd.reports] == ROUND_STEPS
     strengths = [report.strength for report in agpd.reports]
-    assert strengths[1:] == [report.next_scale for report in agpd.reports[:-1]]
+    assert strengths[1:] == [report.next_strength for report in agpd.reports[:-1]]
     guided = success_rate([report.strategy])
     assert strengths[1] == (2 * SCALE if guided >= 0.95 else SCALE / 2)
     last = run.logs[-1]
@@ -111,7 +111,7 @@ def test_every_strategy_fills_the_replay(start, strategy, strengths):
     (report,) = run.agpd.reports
     assert {record.strength for record in run.records(0)} == strengths
     assert report.kept_frames == run.agpd.replay.n_collected_frames > 0
-    assert (report.next_scale != SCALE) == (strategy == "rollin"), "guidance alone adapts"
+    assert (report.next_strength != SCALE) == (strategy == "rollin"), "guidance alone adapts"
 
 
 def test_a_learned_discrepancy_guides_too(start, point_demonstrations, agpd_config, monkeypatch):

@@ -14,6 +14,10 @@ from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig
 WRONG = [
     "teacher.num_inference_steps=0",
     "guidance.scale=-1",
+    "guidance.pull=-0.1",
+    "guidance.pull=1.1",
+    "guidance.max_pull=0.0",
+    "guidance.max_pull=1.5",
     "guidance.max_scale=0.0",
     "collect.every=-1",
     "collect.warmup=0",

@@ -9,6 +9,7 @@ from lerobot.envs.configs import PushtEnv
 from point_environment import PointEnv
 
 from lerobot_agpd.config import (
+    AdversaryConfig,
     CollectConfig,
     FlagError,
     GuidanceConfig,
@@ -66,6 +67,34 @@ def test_a_teacher_that_does_not_denoise_cannot_be_guided(
         return
     with pytest.raises(FlagError, match="'agpd' teacher.*--policy.collect.strategy=teacher"):
         build(config)
+
+
+@pytest.mark.parametrize("strategy", ["guided", "rollin"])
+@pytest.mark.parametrize("guidance", [{}, {"scale": 0.5}])
+def test_a_teacher_that_denoises_in_one_step_cannot_be_guided(build, guided_config, strategy, guidance):
+    config = guided_config(collect=collect(strategy=strategy), guidance=GuidanceConfig(**guidance))
+    config.teacher.num_inference_steps = 1
+    with pytest.raises(FlagError, match=r"^--policy.teacher.num_inference_steps=1: .* variance, which is 0"):
+        build(config)
+    config.collect.strategy = "teacher"
+    build(config)
+
+
+def test_a_pull_that_the_teachers_steps_cannot_follow(build, guided_config):
+    config = guided_config(guidance=GuidanceConfig(pull=0.6))
+    config.teacher.num_inference_steps = 2
+    refusal = r"^--policy.guidance.pull=0.6 is out of reach: the 2 denoising steps .* by at most 0.0\d"
+    with pytest.raises(FlagError, match=refusal):
+        build(config)
+    config.guidance = GuidanceConfig(scale=0.5)
+    build(config)
+
+
+def test_a_student_that_teaches_itself_in_one_step(build, agpd_diffusion_config):
+    config = agpd_diffusion_config(collect=collect(), adversary=AdversaryConfig(weight=0))
+    config.num_inference_steps = 1
+    with pytest.raises(FlagError, match=r"^--policy.num_inference_steps=1: "):
+        build(config, AGPDDiffusionPolicy)
 
 
 # ---- what must fit together ----
@@ -207,7 +236,7 @@ def test_episodes_of_another_run_are_not_adopted(build, guided_config, tmp_path)
 
 
 OTHER_EPISODES = [
-    ({"guidance": GuidanceConfig(at="mu")}, "guidance.at 'x0' instead of 'mu'"),
+    ({"guidance": GuidanceConfig(pull=0.3, at="mu")}, "guidance.at 'x0' instead of 'mu'"),
     ({"collect": collect(min_reward=0.5)}, "collect.min_reward None instead of 0.5"),
     ({"collect": collect(keep_failures=True)}, "collect.keep_failures False instead of True"),
     ({"collect": collect(n_action_steps=2)}, "collect.n_action_steps None instead of 2"),
@@ -224,8 +253,8 @@ def test_episodes_made_with_other_settings_are_not_adopted(build, guided_config,
 def test_episodes_of_another_sampler_are_not_adopted(build, guided_config):
     config = guided_config()
     build(config)
-    config.teacher.num_inference_steps = 3
-    with pytest.raises(ValueError, match="teacher.num_inference_steps None instead of 3"):
+    config.teacher.num_inference_steps = 7
+    with pytest.raises(ValueError, match="teacher.num_inference_steps None instead of 7"):
         build(config)
 
 

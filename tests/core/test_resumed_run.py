@@ -13,7 +13,7 @@ def test_a_resumed_run_goes_on_where_its_checkpoint_was(start, tmp_path):
     resumed = start(first.checkpoint)
     assert resumed.agpd.progress.step == 4 and len(resumed.agpd.reports) == 1
     assert resumed.agpd.replay.n_collected_frames == first.agpd.replay.n_collected_frames
-    assert resumed.agpd.scale == first.agpd.scale != SCALE
+    assert resumed.agpd.strength == first.agpd.strength != SCALE
     assert resumed.agpd.progress.seen_episodes == [0, 1, 2]
     resumed.train(until=5), first.train(until=5)
     assert torch.equal(*(run.agpd.train_batch(run.batch())[FRAME_INDEX] for run in (first, resumed)))

@@ -1,10 +1,10 @@
-"""When rounds are due, and how the guidance scale adapts."""
+"""When rounds are due, and how the strength of guidance adapts."""
 
 import pytest
 from hypothesis import given, strategies as st
 
-from lerobot_agpd.agpd import GROWTH, MIN_SCALE, TOLERANCE, next_scale, rounds_due
-from lerobot_agpd.config import CollectConfig, GuidanceConfig
+from lerobot_agpd.agpd import GROWTH, MIN_STRENGTH, TOLERANCE, next_strength, rounds_due
+from lerobot_agpd.config import DEFAULT_PULL, CollectConfig, FlagError, GuidanceConfig
 
 
 def steps_of_rounds(last=40, **options):
@@ -41,29 +41,55 @@ TOLERATED = 0.5 - TOLERANCE
         (1.0, TOLERATED - 0.01, 0.5, 1 / GROWTH),
         (1.0, 0.0, 0.0, GROWTH),  # a teacher that never succeeds cannot be hurt
         (3.0, 0.8, 0.8, 4.0),  # upper limit
-        (1.5 * MIN_SCALE, 0.0, 0.8, MIN_SCALE),
+        (1.5 * MIN_STRENGTH, 0.0, 0.8, MIN_STRENGTH),
         (9.0, 0.8, 0.8, 9.0),  # a first scale beyond the limit never grows
         (9.0, 0.0, 0.8, 9 / GROWTH),  # and comes back
-        (MIN_SCALE / 2, 0.0, 0.8, MIN_SCALE / 2),  # one below never shrinks to something larger
+        (MIN_STRENGTH / 2, 0.0, 0.8, MIN_STRENGTH / 2),  # one below never shrinks to something larger
         (1.0, None, 0.8, 1.0),  # nothing was guided
         (1.0, 0.8, None, 1.0),  # nothing to compare with
     ],
 )
-def test_next_scale(scale, guided, teacher, expected):
-    assert next_scale(scale, guided, teacher, CONFIG) == expected
+def test_next_strength(scale, guided, teacher, expected):
+    assert next_strength(scale, guided, teacher, CONFIG) == expected
 
 
 @pytest.mark.parametrize("config", [GuidanceConfig(adaptive=False), GuidanceConfig(scale=0.0)])
 def test_a_scale_that_is_fixed_or_zero_stays(config):
-    assert next_scale(config.scale, 1.0, 0.0, config) == config.scale
+    strength = config.first_strength
+    assert next_strength(strength, 1.0, 0.0, config) == strength
+
+
+@pytest.mark.parametrize(
+    ("pull", "guided", "max_pull", "reachable", "expected"),
+    [
+        (0.3, 0.8, 1.0, 1.2, 0.6),
+        (0.6, 0.8, 1.0, 1.2, 1.0),  # the limit of the flag
+        (0.6, 0.8, 1.0, 0.9, 0.9),  # what the sampler can follow
+        (0.6, 0.2, 1.0, 0.9, 0.3),
+        (0.6, 0.8, 0.5, 0.9, 0.6),
+    ],
+)
+def test_a_pull_grows_up_to_its_limit_and_to_what_the_sampler_can_follow(
+    pull, guided, max_pull, reachable, expected
+):
+    config = GuidanceConfig(pull=pull, max_pull=max_pull)
+    assert next_strength(pull, guided, 0.8, config, reachable) == pytest.approx(expected)
+
+
+def test_pull_and_scale_exclude_each_other():
+    with pytest.raises(FlagError, match=r"--policy.guidance.pull=0.3 and --policy.guidance.scale=0.5"):
+        GuidanceConfig(pull=0.3, scale=0.5)
+    assert GuidanceConfig().first_strength == DEFAULT_PULL and GuidanceConfig().unit == "pull"
+    assert (GuidanceConfig(scale=2.0).first_strength, GuidanceConfig(scale=2.0).unit) == (2.0, "scale")
+    assert GuidanceConfig(pull=0.0).first_strength == 0.0, "an explicit 0 is no default"
 
 
 @given(st.lists(st.booleans(), max_size=30))
 def test_an_adapted_scale_stays_within_its_limits(good_rounds):
     scale = CONFIG.scale
     for good in good_rounds:
-        following = next_scale(scale, float(good), 0.5, CONFIG)
-        assert MIN_SCALE <= following <= CONFIG.max_scale and (following >= scale) == (
+        following = next_strength(scale, float(good), 0.5, CONFIG)
+        assert MIN_STRENGTH <= following <= CONFIG.max_scale and (following >= scale) == (
             good or following == scale
         )
         scale = following

@@ -61,7 +61,7 @@ def test_distillation_from_cameras(aloha_demos: Path, tmp_path: Path) -> None:
         "--policy.use_group_norm=true",
         "--policy.horizon=16",
         "--policy.n_action_steps=8",
-        "--policy.num_inference_steps=2",
+        "--policy.num_inference_steps=5",
         "--batch_size=2",
         *QUIET,
         *dataset_flags(aloha_demos),

@@ -13,7 +13,7 @@ from safetensors.torch import load_file
 pytestmark = pytest.mark.slow
 
 PUSHT = ["--env.type=pusht", "--env.obs_type=environment_state_agent_pos", "--env.episode_length=16"]
-SAMPLER = ["--policy.noise_scheduler_type=DDIM", "--policy.num_inference_steps=3"]
+SAMPLER = ["--policy.noise_scheduler_type=DDIM", "--policy.num_inference_steps=5"]
 COMMON = [*QUIET, "--policy.device=cpu", "--policy.push_to_hub=false", "--batch_size=8", *SAMPLER]
 DENOISERS = {
     "mlp": ["--policy.denoiser=mlp", "--policy.mlp.width=32", "--policy.mlp.n_blocks=1"],
@@ -115,7 +115,7 @@ def test_self_distillation(denoiser: str, demos: Path, tmp_path: Path) -> None:
     rounds = reports(output)
     assert [report["strength"] > 0 for report in rounds] == [False, True, True]
     assert [report["strategy"]["generated"] for report in rounds] == [0, 2, 2]
-    assert rounds[0]["next_scale"] == 0.5, "an unguided round does not move the scale"
+    assert rounds[0]["next_strength"] == 0.6, "an unguided round does not move the pull"
     assert rounds[1]["mean_discrepancy"] > 0
 
     checkpoint = output / "checkpoints" / "000006" / "pretrained_model"

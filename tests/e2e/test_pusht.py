@@ -78,7 +78,7 @@ def write_round(root: Path, demos: Path, identity: dict) -> None:
     journal = EpisodeJournal(root)
     journal.begin(dataset.meta, identity)
     journal.append(0, 0, episode, classify(episode, CollectConfig(min_reward=0.9)))
-    report = RoundReport.of(journal.records(0), round=0, strength=0.5, next_scale=0.5, step=0)
+    report = RoundReport.of(journal.records(0), round=0, strength=0.5, next_strength=0.5, step=0)
     journal.finish(0, report.to_json())
 
 

@@ -14,7 +14,7 @@ from lerobot_agpd.rollout.strategies import MixingStrategy, TeacherStrategy
 
 
 def guided(spread=0.5) -> GuidedStrategy:
-    return GuidedStrategy(make_pair(NoisyTeacher(spread)), noise(), GuidanceConfig())
+    return GuidedStrategy(make_pair(NoisyTeacher(spread)), noise(), GuidanceConfig(scale=1.0))
 
 
 # ---- actions ----

@@ -31,7 +31,7 @@ RECORDS = [
 
 
 def report(records, **facts) -> RoundReport:
-    return RoundReport.of(records, **{"round": 0, "strength": 1.0, "next_scale": 2.0, "step": 7, **facts})
+    return RoundReport.of(records, **{"round": 0, "strength": 1.0, "next_strength": 2.0, "step": 7, **facts})
 
 
 def test_tally_by_hand():

@@ -35,7 +35,7 @@ def alone(history, seed=3):
 
 
 def guided(pair=None, seed=3) -> GuidedStrategy:
-    return GuidedStrategy(pair or make_pair(), noise(seed), GuidanceConfig())
+    return GuidedStrategy(pair or make_pair(), noise(seed), GuidanceConfig(scale=1.0))
 
 
 def mixed(form="interpolate", seed=3, **options) -> MixingStrategy:

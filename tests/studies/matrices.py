@@ -73,7 +73,7 @@ def collected(strategy, teacher_only, actions=None, states=None, **changes) -> d
     return {
         "round": 0,
         "strength": 0.5,
-        "next_scale": 0.5,
+        "next_strength": 0.5,
         "step": 10,
         "total": tally(*(sum(counts) for counts in zip(strategy, teacher_only, strict=True))),
         "strategy": tally(*strategy),

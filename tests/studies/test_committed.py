@@ -28,7 +28,11 @@ def test_flags_have_todays_names():
         "policy.collect.teacher_only_fraction": 0.2,
         "policy.collect.mixing.record_teacher": True,
         "seed": 1000,
+        "policy.guidance.scale": 0.5,
     }
+    assert committed.flags({"policy.path": "x"}) == {"policy.path": "x"}, "evaluated only"
+    assert committed.flags({"policy.guidance.pull": 0.3}) == {"policy.guidance.pull": 0.3}
+    assert committed.flags({"policy.guidance.scale": 8})["policy.guidance.scale"] == 8
 
 
 @pytest.mark.parametrize(

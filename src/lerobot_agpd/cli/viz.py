@@ -18,6 +18,7 @@ from rich.table import Table
 from lerobot_agpd.agpd import GuidedStrategy
 from lerobot_agpd.cli.command import StudentFlags, entry_point
 from lerobot_agpd.config import EVALUATION_SEEDS, require
+from lerobot_agpd.guidance.strength import require_strength
 from lerobot_agpd.loading import load_pair
 from lerobot_agpd.progress import REPLAY_FOLDER, Progress
 from lerobot_agpd.replay.episode import Array, EpisodeSpec
@@ -40,8 +41,9 @@ class VizConfig(StudentFlags):
     episodes: int = 1
     # Environment seed of the first episode; also seeds the noise.
     seed: int = EVALUATION_SEEDS[0]
-    # Guidance scale; default: that of the run's next round, else the policy's.
-    scale: float | None = None
+    # Strength of guidance, a pull, or a scale if the policy was trained with guidance.scale; default: that of the run's
+    # next round, else the policy's.
+    strength: float | None = None
     # Recording to write.
     output: Path = Path("outputs/rollout.rrd")
     # Still picture of the first episode to draw.
@@ -59,7 +61,10 @@ class VizConfig(StudentFlags):
         """
         super().__post_init__()
         require(self.episodes >= 1, f"--episodes must be at least 1, got {self.episodes}")
-        require(self.scale is None or self.scale >= 0, f"--scale must not be negative, got {self.scale}")
+        require(
+            self.strength is None or self.strength >= 0,
+            f"--strength must not be negative, got {self.strength}",
+        )
 
 
 # ---- student and teacher ----
@@ -77,35 +82,35 @@ def make_guided_strategy(config: VizConfig) -> GuidedStrategy:
     return GuidedStrategy(sampler.pair_with(teacher), noise, student_config.guidance)
 
 
-def guidance_scale(config: VizConfig) -> float:
-    """`--scale`, else what the checkpoint's run would use in its next round, else where a run starts."""
-    if config.scale is not None:
-        return config.scale
+def guidance_strength(config: VizConfig) -> float:
+    """`--strength`, else what the checkpoint's run would use in its next round, else where a run starts."""
+    if config.strength is not None:
+        return config.strength
     student_config = config.student
     assert student_config.pretrained_path is not None
     try:
         progress = Progress.read(student_config.pretrained_path)
     except FileNotFoundError:  # a checkpoint from the Hub, or one that never trained
-        return student_config.guidance.scale
+        return student_config.guidance.first_strength
     beside = student_config.pretrained_path.resolve().parents[2] / REPLAY_FOLDER
     reports = read_reports(Path(student_config.replay.root or beside))[: progress.rounds]
     if len(reports) < progress.rounds:
         logger.warning("the collected rounds of the checkpoint's run were not found")
-        return student_config.guidance.scale
-    return reports[-1].next_scale if reports else student_config.guidance.scale
+        return student_config.guidance.first_strength
+    return reports[-1].next_strength if reports else student_config.guidance.first_strength
 
 
 # ---- recording a rollout ----
 
 
-def record_rollouts(config: VizConfig, guided: GuidedStrategy, scale: float) -> Iterator[RolloutRecord]:
+def record_rollouts(config: VizConfig, guided: GuidedStrategy, strength: float) -> Iterator[RolloutRecord]:
     """Play the episodes one by one."""
     tasks = make_env(config.env, n_envs=1)
     env = next(iter(next(iter(tasks.values())).values()))
     frames = FrameRecorder(env) if config.render else None
     recorder = DecisionRecorder(guided)
     processors = make_env_pre_post_processors(config.env, config.policy)
-    specs = [EpisodeSpec(number, config.seed + number, scale) for number in range(config.episodes)]
+    specs = [EpisodeSpec(number, config.seed + number, strength) for number in range(config.episodes)]
     try:
         for episode in Rollouts(frames or env, processors, guided, recorder).run(specs):
             pictures = frames.frames if frames is not None else []
@@ -138,16 +143,18 @@ def visualize(config: VizConfig) -> Table:
     Returns:
         A summary with one row per episode.
     """
-    scale = guidance_scale(config)
-    if scale == 0:
-        logger.warning("the guidance scale is 0, so the guided teacher equals the teacher alone")
+    strength, guidance = guidance_strength(config), config.student.guidance
+    if strength == 0:
+        logger.warning("the %s is 0, so the guided teacher equals the teacher alone", guidance.unit)
     guided = make_guided_strategy(config)
-    table = Table("seed", "steps", "max reward", "success", "J alone", "J guided", title=f"scale {scale:g}")
+    require_strength(guided.pair.teacher, strength, guidance, "--teacher.num_inference_steps")
+    title = f"{guidance.unit} {strength:g}"
+    table = Table("seed", "steps", "max reward", "success", "J alone", "J guided", title=title)
     layouts = []
     config.output.parent.mkdir(parents=True, exist_ok=True)
     with rr.RecordingStream(APPLICATION) as stream:
         stream.save(config.output)
-        for number, rollout in enumerate(record_rollouts(config, guided, scale)):
+        for number, rollout in enumerate(record_rollouts(config, guided, strength)):
             root = f"episode_{number}"
             log_rollout(stream, root, rollout)
             layouts.append(layout(root, rollout))

@@ -50,14 +50,8 @@ def posterior(
         x0_hat: (B, H, A) the predicted clean chunk (clipped, if the scheduler clips).
         prev_sample: (B, H, A) the scheduler's own result; DDIM's is its mean.
     """
-    if isinstance(scheduler, DDIMScheduler):
-        previous = timestep - scheduler.config.num_train_timesteps // scheduler.num_inference_steps
-    else:
-        previous = int(scheduler.previous_timestep(timestep))
-    abar = float(scheduler.alphas_cumprod[timestep])
-    abar_previous = float(scheduler.alphas_cumprod[previous]) if previous >= 0 else 1.0
-    alpha = abar / abar_previous
-    variance = (1 - abar_previous) / (1 - abar) * (1 - alpha)
+    abar, abar_previous = noise_levels(scheduler, timestep)
+    alpha, variance = abar / abar_previous, posterior_variance(abar, abar_previous)
     if isinstance(scheduler, DDIMScheduler):
         mean = prev_sample
     else:
@@ -66,6 +60,21 @@ def posterior(
             + alpha**0.5 * (1 - abar_previous) / (1 - abar) * x_t
         )
     return Posterior(mean=mean, variance=variance, x0_hat=x0_hat)
+
+
+def noise_levels(scheduler: DDPMScheduler | DDIMScheduler, timestep: int) -> tuple[float, float]:
+    """abar, the cumulative product of the noise schedule, before and after the reverse step of a (strided) schedule."""
+    if isinstance(scheduler, DDIMScheduler):
+        previous = timestep - scheduler.config.num_train_timesteps // scheduler.num_inference_steps
+    else:
+        previous = int(scheduler.previous_timestep(timestep))
+    abar = float(scheduler.alphas_cumprod[timestep])
+    return abar, float(scheduler.alphas_cumprod[previous]) if previous >= 0 else 1.0
+
+
+def posterior_variance(abar: float, abar_previous: float) -> float:
+    """sigma^2 of a reverse step between two noise levels (DDPM, arXiv:2006.11239, Eq. 7)."""
+    return (1 - abar_previous) / (1 - abar) * (1 - abar / abar_previous)
 
 
 @dataclass(frozen=True)
@@ -93,7 +102,7 @@ class Guide:
 
     Attributes:
         discrepancy: J as a function of the teacher's chunk.
-        scale: (B,) guidance scale of every row; rows at 0 are sampled exactly as without a guide.
+        scale: (B,) guidance scale k of every row; rows at 0 are sampled exactly as without a guide.
         at: where J is differentiated.
         callback: called with every step's GuidedStep, to look inside.
         shift_in_sigmas: per step, (B,) root-mean-square shift divided by sigma; filled while sampling.

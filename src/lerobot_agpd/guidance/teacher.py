@@ -33,6 +33,7 @@ from torch import Tensor
 from lerobot_agpd.config import FlagError, GuidancePoint, require
 from lerobot_agpd.guidance.action_normalizer import ActionNormalizer
 from lerobot_agpd.guidance.guide import Guide
+from lerobot_agpd.guidance.pull import Sampler
 
 Features = Mapping[str, PolicyFeature]
 
@@ -141,6 +142,11 @@ class Teacher(ABC):
     def guidance_points(self) -> tuple[GuidancePoint, ...]:
         """Where J can be differentiated (`--policy.guidance.at`)."""
         return get_args(GuidancePoint) if self.can_be_guided else ()
+
+    @property
+    def sampler(self) -> Sampler | None:
+        """Its denoising steps as numbers, from which a pull follows; None if they are of no known form."""
+        return None
 
     # ---- action spaces ----
 

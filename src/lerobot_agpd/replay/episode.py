@@ -25,7 +25,7 @@ class EpisodeSpec:
     Attributes:
         number: in the round.
         seed: of the environment.
-        strength: guidance scale or mixing weight; 0: the teacher acts alone.
+        strength: pull, guidance scale or mixing weight; 0: the teacher acts alone.
         student_fraction: fraction of the longest possible episode in which the student acts before the teacher.
         retry: whether an earlier round's episode from this start failed.
     """
@@ -98,7 +98,7 @@ class EpisodeRecord:
     Attributes:
         number: in the round.
         seed: of the environment.
-        strength: guidance scale or mixing weight; 0: the teacher acted alone.
+        strength: pull, guidance scale or mixing weight; 0: the teacher acted alone.
         length: number of steps.
         max_reward: largest reward of any step.
         is_success: what the environment says at the last step; None if it reports no success.

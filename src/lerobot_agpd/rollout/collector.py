@@ -104,7 +104,7 @@ class Collector:
 
         Args:
             round_number: of the round.
-            strength: guidance scale, or mixing weight.
+            strength: pull, guidance scale or mixing weight.
             strategy: made for this round; its stopwatch takes the time.
             done: numbers of the episodes that an interrupted round has already collected.
         """

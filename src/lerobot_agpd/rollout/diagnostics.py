@@ -135,7 +135,7 @@ def action_diagnostics(
     Args:
         strategy: its own noise and stopwatch are left alone.
         history: observations (B, T, ...).
-        strength: guidance scale or mixing weight.
+        strength: pull, guidance scale or mixing weight.
         seed: of the noise.
         samples: number K of samples at each observation.
 

@@ -57,8 +57,9 @@ class RoundReport:
 
     Attributes:
         round: number, counted from 0.
-        strength: guidance scale or mixing weight of its episodes.
-        next_scale: guidance scale of the next round.
+        strength: pull, guidance scale (where that flag is given), mixing weight or number of samples of its episodes.
+        guidance_scale: guidance scale k of its guided episodes; None if nothing was guided.
+        next_strength: pull, or guidance scale, of the next round's guided episodes.
         step: training step after which it was collected.
         total: all episodes.
         strategy: those that the strategy decided.
@@ -77,7 +78,7 @@ class RoundReport:
 
     round: int
     strength: float
-    next_scale: float
+    next_strength: float
     step: int
     total: Tally
     strategy: Tally
@@ -90,6 +91,7 @@ class RoundReport:
     mean_discrepancy_teacher_only: float | None
     mean_guidance_shift: float | None
     mean_student_steps: float | None
+    guidance_scale: float | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
     diagnostics: RoundDiagnostics | None = None
 
@@ -138,6 +140,7 @@ class RoundReport:
             "retried_success": success_rate([self.retried]),
             "mean_discrepancy": self.mean_discrepancy,
             "mean_guidance_shift": self.mean_guidance_shift,
+            "guidance_scale": self.guidance_scale,
         }
         measured = self.diagnostics.scalars if self.diagnostics else {}
         known = {name: value for name, value in rates.items() if value is not None}
@@ -166,14 +169,15 @@ def log_round(report: RoundReport) -> None:
     shown = ["-" if rate is None else f"{rate:.2f}" for rate in rates]
     logger.info(
         "round %d: %d episodes, %d invalid, %d successful, %d kept; success of the strategy %s, of the teacher alone %s, of failed "
-        "starts %s; guidance scale -> %.3g; %.0f s",
+        "starts %s; strength %.3g, next %.3g; %.0f s",
         report.round,
         report.total.generated,
         report.total.invalid,
         report.total.successful,
         report.total.kept,
         *shown,
-        report.next_scale,
+        report.strength,
+        report.next_strength,
         sum(report.seconds.values()),
     )
     if report.total.kept == 0:

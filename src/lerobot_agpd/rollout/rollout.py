@@ -26,7 +26,7 @@ class Decision:
 
     Attributes:
         history: raw observations (B, n_obs_steps, ...) and tasks that it was made at.
-        strength: (B,) guidance scales or mixing weights.
+        strength: (B,) pulls, guidance scales or mixing weights.
         student_acts: (B,) bool, True where the student acted.
         chunks: what was decided.
         noise: state of the strategy's generator before it; drawing from it again gives the same noise.

@@ -58,7 +58,7 @@ def episode_specs(
         rank: of this process.
         n_ranks: number of processes.
         round_number: of the round.
-        strength: guidance scale, or mixing weight.
+        strength: pull, guidance scale or mixing weight.
         teacher_only_fraction: fraction of the episodes whose strength is 0.
         student_begins: whether the student acts for a first part of every episode.
         retries: environment seeds from which episodes start again. They take the places of the first ones that are

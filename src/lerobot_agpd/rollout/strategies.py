@@ -69,7 +69,7 @@ class Strategy(ABC):
 
         Args:
             history: raw observations (B, n_obs_steps, ...), and under "task" B instructions.
-            strength: (B,) guidance scales, or mixing weights; at 0 the teacher acts as it does alone.
+            strength: (B,) pulls, guidance scales or mixing weights; at 0 the teacher acts as it does alone.
             student_acts: (B,) bool, True where the student still acts (rollin only); None: nowhere.
         """
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -74,6 +74,7 @@ def configured(student_config: StudentConfig, setting: Setting) -> StudentConfig
     config = deepcopy(student_config)
     if setting.strategy == "teacher" or setting.strategy == "guided":
         config.collect.strategy = setting.strategy
+        config.guidance = replace(config.guidance, pull=None, scale=setting.strength)
     else:
         config.collect.strategy, config.collect.mixing.form = "mixing", setting.strategy
     return config

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from lerobot_agpd.config import require
 from lerobot_agpd.guidance.guide import Guide, guided
+from lerobot_agpd.guidance.pull import Sampler, diffusion_sampler
 from lerobot_agpd.guidance.teacher import Teacher
 
 if TYPE_CHECKING:
@@ -52,6 +53,12 @@ class DiffusionTeacher(Teacher):
     def resizes_images(self) -> bool:
         """Whether it accepts images of any size."""
         return self.policy.config.resize_shape is not None
+
+    @property
+    def sampler(self) -> Sampler:
+        """The steps of its noise scheduler."""
+        model = self.policy.diffusion
+        return diffusion_sampler(model.noise_scheduler, model.num_inference_steps)
 
     def set_sampler(self, num_inference_steps: int | None, noise_scheduler: str | None) -> None:
         """Exchange the scheduler, or the number of its steps."""

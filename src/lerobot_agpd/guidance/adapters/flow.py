@@ -9,6 +9,7 @@ from lerobot_agpd.config import GuidancePoint
 from lerobot_agpd.guidance.adapters.diffusion import DiffusionTeacher, set_diffusion_sampler, stack_cameras
 from lerobot_agpd.guidance.flow import guided_velocity
 from lerobot_agpd.guidance.guide import Guide, guided
+from lerobot_agpd.guidance.pull import Sampler, diffusion_sampler, flow_sampler
 from lerobot_agpd.guidance.teacher import seeded_by
 
 
@@ -35,6 +36,14 @@ class MultiTaskDiTTeacher(DiffusionTeacher):
     def guidance_points(self) -> tuple[GuidancePoint, ...]:
         """Where J can be differentiated: a flow has no posterior mean."""
         return ("x0",) if self.policy.config.is_flow_matching else ("x0", "mu")
+
+    @property
+    def sampler(self) -> Sampler | None:
+        """The steps of its scheduler, or the Euler steps of its flow; other integrators are of no known form."""
+        config, objective = self.policy.config, self.policy.objective
+        if config.is_diffusion:
+            return diffusion_sampler(objective.noise_scheduler, objective.num_inference_steps)
+        return flow_sampler(config.num_integration_steps) if config.integration_method == "euler" else None
 
     def set_sampler(self, num_inference_steps: int | None, noise_scheduler: str | None) -> None:
         """Exchange the number of steps, and for diffusion the scheduler."""

@@ -18,6 +18,7 @@ from torch import Tensor
 from lerobot_agpd.config import GuidancePoint, require
 from lerobot_agpd.guidance.flow import guided_velocity
 from lerobot_agpd.guidance.guide import Guide
+from lerobot_agpd.guidance.pull import Sampler, flow_sampler
 from lerobot_agpd.guidance.teacher import Features, Teacher
 
 EMPTY_CAMERA = "empty_camera"
@@ -74,6 +75,15 @@ class RTCTeacher(Teacher):
     def guidance_points(self) -> tuple[GuidancePoint, ...]:
         """Where J can be differentiated: a flow has no posterior mean."""
         return ("x0",)
+
+    @property
+    def sampler(self) -> Sampler:
+        """The Euler steps of its flow."""
+        return flow_sampler(getattr(self.policy.config, self._steps_field))
+
+    @property
+    def _steps_field(self) -> str:
+        return "num_steps" if hasattr(self.policy.config, "num_steps") else "num_inference_steps"
 
     def set_sampler(self, num_inference_steps: int | None, noise_scheduler: str | None) -> None:
         """Exchange the number of Euler steps."""

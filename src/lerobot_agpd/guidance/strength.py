@@ -1,0 +1,80 @@
+"""The strength of guidance as the flags give it, a pull or a scale, and the guidance scale k of a teacher for it."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from lerobot_agpd.config import GuidanceConfig, require
+from lerobot_agpd.guidance.pull import acts, largest_pull, scale_of_pull
+from lerobot_agpd.guidance.teacher import Teacher
+
+STEPS_FLAG = "--policy.teacher.num_inference_steps"
+
+
+def require_strength(
+    teacher: Teacher, strength: float, config: GuidanceConfig, steps_flag: str = STEPS_FLAG
+) -> None:
+    """Refuse a strength that the teacher's sampler cannot follow.
+
+    Args:
+        teacher: one that can be guided.
+        strength: of the first round; 0 is always possible.
+        config: its unit, and where J is differentiated.
+        steps_flag: the flag that sets the number of denoising steps.
+
+    Raises:
+        FlagError: naming the flag.
+    """
+    sampler = teacher.sampler
+    if strength == 0 or (sampler is None and config.unit == "scale"):
+        return
+    require(
+        sampler is not None,
+        f"--policy.guidance.pull is not known for a {teacher.type} teacher, whose denoising steps are not of a known "
+        "form; give --policy.guidance.scale instead",
+    )
+    assert sampler is not None
+    require(
+        acts(sampler),
+        f"{steps_flag}={len(sampler)}: guidance shifts a denoising step by a multiple of its posterior variance, which is 0 "
+        f"in every step of this {teacher.type} teacher; take 5 steps or more, or let it act alone "
+        "(--policy.collect.strategy=teacher)",
+    )
+    if config.unit == "scale":
+        return
+    largest = largest_strength(teacher, config)
+    require(
+        strength <= largest,
+        f"--policy.guidance.pull={strength:g} is out of reach: the {len(sampler)} denoising steps of the {teacher.type} teacher "
+        f"pull by at most {math.floor(100 * largest) / 100:g} (--policy.guidance.at={config.at}); lower it, or raise "
+        f"{steps_flag}",
+    )
+
+
+def guidance_scale(teacher: Teacher, strength: float, config: GuidanceConfig) -> float:
+    """Return k of Eq. 20 for one strength that the teacher can follow (`require_strength`)."""
+    if strength == 0 or config.unit == "scale":
+        return strength
+    assert teacher.sampler is not None
+    # Strengths of rows are float32, which may be above what they stand for.
+    reachable = min(round(strength, 6), largest_strength(teacher, config))
+    return scale_of_pull(teacher.sampler, reachable, config.at)
+
+
+def guidance_scales(teacher: Teacher, strength: Tensor, config: GuidanceConfig) -> Tensor:
+    """Return k of every row, (B,), for strengths (B,)."""
+    if config.unit == "scale":
+        return strength
+    values, row = strength.unique(return_inverse=True)  # a round has two: 0 and its own
+    scales = [guidance_scale(teacher, value, config) for value in values.tolist()]
+    return torch.tensor(scales).to(strength)[row]
+
+
+def largest_strength(teacher: Teacher, config: GuidanceConfig) -> float:
+    """The largest strength that the teacher's sampler can follow."""
+    if config.unit == "scale" or teacher.sampler is None:
+        return math.inf
+    return largest_pull(teacher.sampler, config.at)
