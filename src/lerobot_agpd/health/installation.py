@@ -210,7 +210,8 @@ def _video() -> Iterator[Finding]:
         try:
             importlib.import_module(module)
         except Exception as error:  # a missing ffmpeg is a RuntimeError
-            errors[name] = f"{name}: {str(error).strip().partition('. ')[0].splitlines()[0]}"
+            text = str(error).strip() or type(error).__name__
+            errors[name] = f"{name}: {text.partition('. ')[0].splitlines()[0]}"
     if not errors:
         yield Finding(Severity.OK, "video", "torchcodec and PyAV can be imported")
     elif len(errors) == 1:
