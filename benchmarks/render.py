@@ -28,6 +28,7 @@ BENCHMARKS = ROOT / "benchmarks"
 COMPARISON = BENCHMARKS / "comparison"
 PAGES = ROOT / "docs" / "results"
 README = ROOT / "README.md"
+WHEN = ROOT / "docs" / "when_guidance_helps.md"
 SUMMARY = {
     "bc": "cloning",
     "pd": "PD",
@@ -37,7 +38,16 @@ SUMMARY = {
     "agpd_long": "AGPD, 3x steps",
     "teacher": "teacher",
 }
-"""Methods of the README's table, and their names there."""
+"""Methods of the README's table of tasks with one way, and their names there."""
+WAYS_SUMMARY = {
+    "bc": "cloning",
+    "pd": "PD",
+    "dagger": "DAgger",
+    "nearest_4": "nearest of 4",
+    "agpd": "AGPD",
+    "teacher": "teacher",
+}
+"""The same of tasks with several ways."""
 
 Results = dict[str, dict[str, list[RunResult]]]
 """Task and method to results, one per training seed."""
@@ -145,15 +155,19 @@ def comparison_page(path: Path, matrix: Matrix, results: Results, missing: list[
     return f"{notes}\n\n{comparison_report(matrix, results, missing, pictures)}"
 
 
-def summary(comparisons: dict[Path, tuple[Matrix, Results, list[str]]]) -> str:
+def summary(
+    comparisons: dict[Path, tuple[Matrix, Results, list[str]]], names: dict[str, str], several_ways: bool
+) -> str:
     """One row per task and one column per method: the task's measure at the last checkpoint."""
-    rows = [("", *SUMMARY.values(), "AGPD minus PD")]
+    rows = [("", *names.values(), "AGPD minus PD")]
     for path, (matrix, results, _) in comparisons.items():
         for task, methods in results.items():
+            if any(run.ways for runs in methods.values() for run in runs) != several_ways:
+                continue
             entry = matrix.tasks[task]
             measure = "" if entry.measure == "success" else ", mean max reward"
             link = f"[{entry.title or task}](docs/results/comparison-{path.stem}.md){measure}"
-            cells = [summary_cell(methods.get(name, []), entry.measure) for name in SUMMARY]
+            cells = [summary_cell(methods.get(name, []), entry.measure) for name in names]
             pair = (methods.get("agpd", []), methods.get("pd", []))
             rows.append((link, *cells, difference_cell(*pair, "last", entry.measure)))
     return markdown(rows)
@@ -191,7 +205,10 @@ def render(draw: bool) -> dict[Path, str]:
         if draw:
             write_pictures(matrix, results, matrix.output)
         pages[PAGES / f"comparison-{path.stem}.md"] = comparison_page(path, matrix, results, missing)
-    pages[README] = filled(pages[README], "comparison", summary(comparisons))
+    several = summary(comparisons, WAYS_SUMMARY, several_ways=True)
+    pages[README] = filled(pages[README], "comparison", summary(comparisons, SUMMARY, several_ways=False))
+    pages[README] = filled(pages[README], "ways", several)
+    pages[WHEN] = filled(WHEN.read_text(), "ways", several.replace("(docs/", "("))
     return pages
 
 

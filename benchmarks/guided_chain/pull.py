@@ -42,9 +42,9 @@ ROOT = Path(__file__).parents[2]
 STEPS = (1, 2, 5, 10, 16, 50, 100)
 SCHEDULERS = {"DDPM": DDPMScheduler, "DDIM": DDIMScheduler}
 MIXTURE_STEPS = (5, 10, 50)
-SCALES, PULLS = (0.5, 2.0), (0.3, 0.6, 0.9)
+SCALES, PULLS = (0.5, 4.0), (0.3, 0.6, 0.9)
 N, ENTRIES, WITHIN, LEAN = 400, 8, 0.05, 0.4
-REFERENCES = (0.15, 0.3, 0.5, 1.0)
+REFERENCES = (0.1, 0.15, 0.3, 1.0)
 REFERENCE_PULLS = (0.15, 0.3, 0.6)
 
 
@@ -84,7 +84,7 @@ def scheduler(kind: str) -> DDPMScheduler | DDIMScheduler:
 def solved(chain: Chain, pull: float, spread: float = SPREAD) -> float | None:
     """The scale of a pull, None if out of reach."""
     try:
-        return scale_of_pull(chain.sampler, pull, chain.at, spread, spread)
+        return scale_of_pull(chain.sampler, pull, chain.at, spread, DISTANCE)
     except ValueError:
         return None
 
@@ -107,12 +107,12 @@ def gaussian() -> dict:
                     for name, scale in scales.items()
                 }
                 for spread, distance in (
-                    (0.1, 0.3),
+                    (0.05, 0.3),
+                    (0.15, 0.3),
+                    (0.15, 1.0),
+                    (0.15, 2.0),
                     (0.3, 0.3),
-                    (0.3, 1.0),
-                    (0.3, 2.0),
                     (0.6, 0.3),
-                    (1.0, 0.3),
                 )
             },
         }

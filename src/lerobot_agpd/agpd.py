@@ -41,7 +41,7 @@ from lerobot_agpd.build import Parts
 from lerobot_agpd.config import CollectConfig, GuidanceConfig, StudentConfig
 from lerobot_agpd.guidance.guide import Guide
 from lerobot_agpd.guidance.representation import WEIGHT, reconstruction_loss
-from lerobot_agpd.guidance.strength import guidance_scale, guidance_scales, largest_strength
+from lerobot_agpd.guidance.strength import first_strength, guidance_scale, guidance_scales, largest_strength
 from lerobot_agpd.guidance.teacher import History
 from lerobot_agpd.guidance.teacher_student import TeacherStudent
 from lerobot_agpd.replay.demonstrations import Batch
@@ -204,7 +204,10 @@ class AGPD:
     @property
     def strength(self) -> float:
         """Pull (or guidance scale) of the next round's guided episodes."""
-        return self.reports[-1].next_strength if self.reports else self.config.guidance.first_strength
+        if self.reports:
+            return self.reports[-1].next_strength
+        assert self.teacher is not None
+        return first_strength(self.teacher, self.config.guidance)
 
     def collect_round(self) -> RoundReport:
         """One round: every process rolls out its part, successes become part of T."""

@@ -11,7 +11,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.envs import EnvConfig
 
 from lerobot_agpd.config import StudentConfig, require
-from lerobot_agpd.guidance.strength import STEPS_FLAG, require_strength
+from lerobot_agpd.guidance.strength import STEPS_FLAG, first_strength, require_strength
 from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.loading import check_fit, collection_environment, load_teacher
 from lerobot_agpd.progress import Progress, find_replay_root
@@ -280,7 +280,7 @@ def _check_strength(
         teacher = self_teacher.unchanged(stats)
         steps_flag = "--policy.num_inference_steps"
     if config.needs_guidance and teacher is not None:
-        require_strength(teacher, guidance.first_strength, guidance, steps_flag)
+        require_strength(teacher, first_strength(teacher, guidance), guidance, steps_flag)
 
 
 def _warn_of_settings(config: StudentConfig) -> None:

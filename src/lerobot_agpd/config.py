@@ -106,7 +106,7 @@ class GuidanceConfig:
     """How strongly, and where, the teacher's denoising is pulled toward the student (Eq. 20)."""
 
     # Pull of the first round: how far a chunk goes toward the student, from 0 (guidance off) to 1. The guidance scale is
-    # computed from it for the teacher's own sampler (guidance/pull.py). Default: 0.6, unless guidance.scale is given.
+    # computed from it for the teacher's own sampler (guidance/pull.py). Default: 0.6, or as much of it as the teacher's denoising steps can follow.
     pull: float | None = None
     # Instead of a pull: guidance scale k of the first round (Eq. 20), which pulls differently with every sampler; positive
     # is toward the student.
@@ -144,8 +144,13 @@ class GuidanceConfig:
         return "pull" if self.scale is None else "scale"
 
     @property
+    def is_default(self) -> bool:
+        """Whether no strength was given."""
+        return self.pull is None and self.scale is None
+
+    @property
     def first_strength(self) -> float:
-        """Strength of the first round, in `unit`."""
+        """Strength of the first round, in `unit`; the default may be more than a teacher's sampler can follow."""
         if self.scale is not None:
             return self.scale
         return DEFAULT_PULL if self.pull is None else self.pull

@@ -39,9 +39,9 @@ def test_the_quickstart_s_teacher_has_one_way(monkeypatch, tmp_path, capsys):
     assert 0 < evidence["spread"] < 0.05
     assert [(pull["strategy"], pull["strength"]) for pull in evidence["pulls"]] == [
         ("teacher", 0),
-        ("guided", 0.5),
-        ("guided", 2),
-        ("guided", 8),
+        ("guided", 0.3),
+        ("guided", 0.6),
+        ("guided", 1.0),
         ("nearest", 4),
         ("nearest", 16),
     ]

@@ -107,16 +107,16 @@ def test_student_chunk_is_what_the_policy_executes(monkeypatch, student):
 
 
 def test_scale_is_given_or_the_runs_or_the_policys(monkeypatch, student, tmp_path):
-    assert viz.guidance_strength(make_config(monkeypatch, student, strength=0.25)) == 0.25
-    assert viz.guidance_strength(make_config(monkeypatch, student)) == 2.0
+    assert viz.guidance_strength(make_config(monkeypatch, student, strength=0.25), None) == 0.25
+    assert viz.guidance_strength(make_config(monkeypatch, student), None) == 2.0
     Progress(step=10, rounds=2).save(student)
-    assert viz.guidance_strength(make_config(monkeypatch, student)) == 2.0  # the rounds are gone
+    assert viz.guidance_strength(make_config(monkeypatch, student), None) == 2.0  # the rounds are gone
     for number, scale in enumerate((3.0, 6.0, 12.0)):  # the last one is newer than the checkpoint
         folder = tmp_path / f"run/agpd/round-{number:05d}"
         folder.mkdir(parents=True)
         facts = {"round": number, "strength": 1.0, "next_strength": scale, "step": 10}
         write_json(folder / "report.json", RoundReport.of([], **facts).to_json())
-    assert viz.guidance_strength(make_config(monkeypatch, student)) == 6.0
+    assert viz.guidance_strength(make_config(monkeypatch, student), None) == 6.0
 
 
 def test_teacher_flags_override_the_checkpoints(monkeypatch, student, teacher):

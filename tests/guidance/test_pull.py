@@ -102,10 +102,10 @@ def test_the_scale_of_a_pull_pulls_so_far_and_no_smaller_one_does(kind_and_steps
 def test_a_pull_of_zero_is_no_guidance_and_one_out_of_reach_an_error():
     chain = sampler("DDPM", 5)
     assert scale_of_pull(chain, 0.0, "x0") == 0.0
-    assert 0.5 < largest_pull(chain, "x0") < 0.7
-    assert scale_of_pull(chain, largest_pull(chain, "x0"), "x0") > 0
+    assert 0.5 < largest_pull(chain, "x0", spread=0.3) < 0.7
+    assert scale_of_pull(chain, largest_pull(chain, "x0", spread=0.3), "x0", spread=0.3) > 0
     with pytest.raises(ValueError, match=r"the largest pull is 0.6\d*, not 0.8"):
-        scale_of_pull(chain, 0.8, "x0")
+        scale_of_pull(chain, 0.8, "x0", spread=0.3)
 
 
 @pytest.mark.parametrize("kind", ["DDPM", "DDIM"])

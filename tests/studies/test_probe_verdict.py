@@ -7,9 +7,9 @@ import pytest
 from lerobot_agpd.studies.probe_verdict import Evidence, Pull, StateCount, conclude, fewer_steps
 
 ALONE = Pull("teacher", 0, moved=0.0, chooses=0.35, off=0.04)
-WEAK = Pull("guided", 0.5, moved=0.4, chooses=0.8, off=0.05)
-ENOUGH = Pull("guided", 2, moved=0.8, chooses=0.95, off=0.06)
-LOST = Pull("guided", 8, moved=0.9, chooses=1.0, off=0.5)
+WEAK = Pull("guided", 0.3, moved=0.4, chooses=0.8, off=0.05)
+ENOUGH = Pull("guided", 0.6, moved=0.8, chooses=0.95, off=0.06)
+LOST = Pull("guided", 1.0, moved=0.9, chooses=1.0, off=0.5)
 NEAREST = Pull("nearest", 16, moved=0.7, chooses=0.99, off=0.04)
 SEVERAL = Evidence(
     spread=0.3,
@@ -37,14 +37,20 @@ def test_a_deterministic_teacher():
     assert verdict.finding == "deterministic" and verdict.flags == TEACHER_FLAGS
 
 
-def test_several_ways_whose_median_is_none_are_guided_by_the_weakest_scale_that_decides():
+def test_several_ways_whose_median_is_none_are_guided_by_the_weakest_pull_that_decides():
     verdict = conclude(SEVERAL)
     assert verdict.finding == "several ways"
     assert verdict.flags == (
-        "--policy.collect.strategy=guided --policy.guidance.scale=2 --policy.guidance.max_scale=2"
+        "--policy.collect.strategy=guided --policy.guidance.pull=0.6 --policy.guidance.max_pull=0.6"
     )
     assert "20 of 20 first states of episodes (100%)" in verdict.reasons[0]
     assert "3 of 64 states anywhere (5%)" in verdict.reasons[0]
+
+
+def test_a_pull_may_grow_as_far_as_the_chunks_keep_to_the_ways():
+    strong = replace(LOST, off=0.05)
+    verdict = conclude(replace(SEVERAL, pulls=[ALONE, WEAK, ENOUGH, strong]))
+    assert verdict.flags == "--policy.collect.strategy=guided --policy.guidance.pull=0.6"
 
 
 def test_several_ways_whose_median_is_one():
@@ -82,7 +88,10 @@ def test_a_teacher_that_cannot_be_guided_gets_nearest():
     ("pulls", "flags"),
     [
         ([ALONE, WEAK, LOST, NEAREST], "nearest_samples=16"),  # guidance is too weak, or leaves the ways
-        ([ALONE, WEAK, LOST], "guidance.scale=0.5"),  # the best that keeps to the ways
+        (
+            [ALONE, WEAK, LOST],
+            "guidance.pull=0.3 --policy.guidance.max_pull=0.3",
+        ),  # the best that keeps to the ways
     ],
 )
 def test_guidance_that_does_not_decide_without_leaving_the_ways(pulls, flags):

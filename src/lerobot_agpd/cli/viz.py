@@ -18,7 +18,8 @@ from rich.table import Table
 from lerobot_agpd.agpd import GuidedStrategy
 from lerobot_agpd.cli.command import StudentFlags, entry_point
 from lerobot_agpd.config import EVALUATION_SEEDS, require
-from lerobot_agpd.guidance.strength import require_strength
+from lerobot_agpd.guidance.strength import first_strength, require_strength
+from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.loading import load_pair
 from lerobot_agpd.progress import REPLAY_FOLDER, Progress
 from lerobot_agpd.replay.episode import Array, EpisodeSpec
@@ -82,7 +83,7 @@ def make_guided_strategy(config: VizConfig) -> GuidedStrategy:
     return GuidedStrategy(sampler.pair_with(teacher), noise, student_config.guidance)
 
 
-def guidance_strength(config: VizConfig) -> float:
+def guidance_strength(config: VizConfig, teacher: Teacher) -> float:
     """`--strength`, else what the checkpoint's run would use in its next round, else where a run starts."""
     if config.strength is not None:
         return config.strength
@@ -91,13 +92,13 @@ def guidance_strength(config: VizConfig) -> float:
     try:
         progress = Progress.read(student_config.pretrained_path)
     except FileNotFoundError:  # a checkpoint from the Hub, or one that never trained
-        return student_config.guidance.first_strength
+        return first_strength(teacher, student_config.guidance)
     beside = student_config.pretrained_path.resolve().parents[2] / REPLAY_FOLDER
     reports = read_reports(Path(student_config.replay.root or beside))[: progress.rounds]
     if len(reports) < progress.rounds:
         logger.warning("the collected rounds of the checkpoint's run were not found")
-        return student_config.guidance.first_strength
-    return reports[-1].next_strength if reports else student_config.guidance.first_strength
+        return first_strength(teacher, student_config.guidance)
+    return reports[-1].next_strength if reports else first_strength(teacher, student_config.guidance)
 
 
 # ---- recording a rollout ----
@@ -143,10 +144,10 @@ def visualize(config: VizConfig) -> Table:
     Returns:
         A summary with one row per episode.
     """
-    strength, guidance = guidance_strength(config), config.student.guidance
+    guided, guidance = make_guided_strategy(config), config.student.guidance
+    strength = guidance_strength(config, guided.pair.teacher)
     if strength == 0:
         logger.warning("the %s is 0, so the guided teacher equals the teacher alone", guidance.unit)
-    guided = make_guided_strategy(config)
     require_strength(guided.pair.teacher, strength, guidance, "--teacher.num_inference_steps")
     title = f"{guidance.unit} {strength:g}"
     table = Table("seed", "steps", "max reward", "success", "J alone", "J guided", title=title)

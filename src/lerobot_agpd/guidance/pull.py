@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -29,8 +30,12 @@ from lerobot_agpd.guidance import guide
 from lerobot_agpd.guidance.flow import clean_variance
 from lerobot_agpd.guidance.guide import noise_levels, posterior_variance
 
-SPREAD = 0.3
-"""Standard deviation of the reference teacher's chunks, in the teacher's normalized space."""
+SPREAD = 0.15
+"""Standard deviation of the reference teacher's chunks, in the teacher's normalized space.
+
+What the trained teachers of tasks with several ways have. With a larger one the strengths that make them choose would
+lie beyond 1 ("How far guidance pulls" in docs/method.md).
+"""
 
 DISTANCE = 0.3
 """Distance of the reference student in every entry. It matters only where the trust region acts."""
@@ -75,9 +80,9 @@ Sampler = tuple[ReverseStep, ...]
 
 def diffusion_sampler(scheduler: DDPMScheduler | DDIMScheduler, n_steps: int) -> Sampler:
     """The steps of a diffusers scheduler, which is left as it is (DDPM, arXiv:2006.11239; DDIM, arXiv:2010.02502)."""
-    scheduler = type(scheduler).from_config(scheduler.config)
-    scheduler.set_timesteps(n_steps)
-    return tuple(_diffusion_step(scheduler, int(timestep)) for timestep in scheduler.timesteps)
+    copied = deepcopy(scheduler)
+    copied.set_timesteps(n_steps)
+    return tuple(_diffusion_step(copied, int(timestep)) for timestep in copied.timesteps)
 
 
 def _diffusion_step(scheduler: DDPMScheduler | DDIMScheduler, timestep: int) -> ReverseStep:

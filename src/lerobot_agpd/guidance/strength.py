@@ -14,6 +14,16 @@ from lerobot_agpd.guidance.teacher import Teacher
 STEPS_FLAG = "--policy.teacher.num_inference_steps"
 
 
+WEAKEST_PULL = 0.1
+"""A teacher that the default cannot pull at least so far is refused."""
+
+
+def first_strength(teacher: Teacher, config: GuidanceConfig) -> float:
+    """Strength of the first round: what the flags say, or as much of the default pull as the sampler can follow."""
+    asked = config.first_strength
+    return max(min(asked, largest_strength(teacher, config)), WEAKEST_PULL) if config.is_default else asked
+
+
 def require_strength(
     teacher: Teacher, strength: float, config: GuidanceConfig, steps_flag: str = STEPS_FLAG
 ) -> None:

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from lerobot_agpd.agpd import GuidedStrategy
 from lerobot_agpd.config import GuidanceConfig
+from lerobot_agpd.guidance.strength import largest_strength
 from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.guidance.teacher_student import TeacherStudent
 from lerobot_agpd.replay.episode import Array
@@ -121,7 +122,7 @@ class TeacherProbe:
 
     def pulls(self) -> list[Pull]:
         """The teacher alone, guided if it can be, and the nearest of several samples."""
-        guided = GUIDANCE_STRENGTHS if self.teacher.can_be_guided else ()
+        guided = self._guidance_strengths if self.teacher.can_be_guided else []
         settings: list[tuple[PullName, float]] = [("teacher", 0.0)]
         settings += [("guided", strength) for strength in guided]
         settings += [("nearest", float(number)) for number in NEAREST_SAMPLES]
@@ -137,6 +138,17 @@ class TeacherProbe:
             )
             for (name, strength), pulled in chunks.items()
         ]
+
+    @property
+    def _guidance_strengths(self) -> list[float]:
+        """Those that the teacher's denoising steps can follow; scales of the same numbers if they are of no known form."""
+        largest = largest_strength(self.teacher, self._guidance)
+        return [strength for strength in GUIDANCE_STRENGTHS if strength <= largest]
+
+    @property
+    def _guidance(self) -> GuidanceConfig:
+        at = self.student.config.guidance.at if self.student else self.teacher.guidance_points[0]
+        return GuidanceConfig(at=at) if self.teacher.sampler else GuidanceConfig(at=at, scale=1.0)
 
     def _pulled(self, name: PullName, strength: float) -> Tensor:
         """Chunks (S, PULLED, n, A) of a strategy in the teacher's normalized space."""
@@ -159,8 +171,7 @@ class TeacherProbe:
             unnormalize=self.teacher.unnormalize,
         )
         if name == "guided":
-            at = self.student.config.guidance.at if self.student else self.teacher.guidance_points[0]
-            return GuidedStrategy(pair, noise, GuidanceConfig(at=at))
+            return GuidedStrategy(pair, noise, self._guidance)
         return NearestStrategy(pair, noise) if name == "nearest" else TeacherStrategy(pair, noise)
 
     def _average(self, pulled: Tensor, measure: Callable[[Ways, Array, Array], Array]) -> float | None:

@@ -8,11 +8,15 @@ from typing import Literal
 
 from scipy.stats import binomtest
 
+from lerobot_agpd.config import GuidanceConfig
+
 PullName = Literal["teacher", "guided", "nearest"]
 Finding = Literal["deterministic", "one way", "several ways, median a way", "several ways"]
 
-GUIDANCE_STRENGTHS = (0.5, 2.0, 8.0)
-"""Guidance scales that are tried, weakest first."""
+GUIDANCE_STRENGTHS = (0.3, 0.6, 1.0)
+"""Pulls that are tried, weakest first, as far as the teacher's denoising steps can follow them."""
+
+MAX_PULL = GuidanceConfig().max_pull
 
 NEAREST_SAMPLES = (4, 16)
 """Numbers of samples that `nearest` is tried with."""
@@ -42,7 +46,7 @@ class Pull:
 
     Attributes:
         strategy: `teacher` (alone), `guided` or `nearest`.
-        strength: guidance scale, or number of samples.
+        strength: pull, or number of samples.
         moved: fraction of the teacher's root-mean-square distance from the target by which it is nearer.
         chooses: at states with several ways, fraction of its chunks on the target's; None without such states.
         off: at the same states, fraction of its chunks that are no way.
@@ -167,16 +171,17 @@ def recommend(evidence: Evidence) -> tuple[str, str]:
         sentence = f"This teacher cannot be guided. {sentence}"
     if not enough:
         sentence += f" None of those tried reaches {CHOOSES:.0%} without leaving the ways."
-    return sentence, pull_flags(best)
+    # An adapted pull may rise no higher than what was found to keep to the ways.
+    limit = max((pull.strength for pull in staying if pull.strategy == "guided"), default=best.strength)
+    return sentence, pull_flags(best, limit)
 
 
-def pull_flags(pull: Pull) -> str:
-    """The flags of `lerobot-train` that begin with a pull."""
+def pull_flags(pull: Pull, limit: float) -> str:
+    """The flags of `lerobot-train` that begin with a strength, which may grow up to a limit."""
     if pull.strategy == "nearest":
         return f"--policy.collect.strategy=nearest --policy.collect.nearest_samples={pull.strength:.0f}"
-    # The adapted scale may rise no higher than what was found to keep to the ways.
-    scale = f"{pull.strength:g}"
-    return f"--policy.collect.strategy=guided --policy.guidance.scale={scale} --policy.guidance.max_scale={scale}"
+    most = "" if limit == MAX_PULL else f" --policy.guidance.max_pull={limit:g}"
+    return f"--policy.collect.strategy=guided --policy.guidance.pull={pull.strength:g}{most}"
 
 
 def fewer_steps(success: Sequence[tuple[int, float, float]]) -> str:
@@ -214,4 +219,4 @@ def _stays(pull: Pull, alone: Pull) -> bool:
 def _name(pull: Pull) -> str:
     if pull.strategy == "nearest":
         return f"The nearest of {pull.strength:.0f} samples"
-    return f"Guidance at scale {pull.strength:g}"
+    return f"Guidance with pull {pull.strength:g}"

@@ -57,7 +57,7 @@ class RTCTeacher(Teacher):
         return {key: feature for key, feature in features.items() if EMPTY_CAMERA not in key}
 
     @property
-    def n_denoising_steps(self) -> int | None:
+    def n_denoising_steps(self) -> int:
         """Euler steps."""
         return getattr(self.policy.config, self._steps_field)
 
@@ -79,11 +79,7 @@ class RTCTeacher(Teacher):
     @property
     def sampler(self) -> Sampler:
         """The Euler steps of its flow."""
-        return flow_sampler(getattr(self.policy.config, self._steps_field))
-
-    @property
-    def _steps_field(self) -> str:
-        return "num_steps" if hasattr(self.policy.config, "num_steps") else "num_inference_steps"
+        return flow_sampler(self.n_denoising_steps)
 
     def set_sampler(self, num_inference_steps: int | None, noise_scheduler: str | None) -> None:
         """Exchange the number of Euler steps."""
