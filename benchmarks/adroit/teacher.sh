@@ -12,5 +12,5 @@ lerobot-train --config_path="$here/../../examples/presets/teacher_cpu.yaml" \
     --seed=1000 --log_freq=500 --save_freq=2000 --output_dir="$output" "$@"
 lerobot-eval --policy.path="$last" --policy.device=cpu \
     --env.type=gymnasium_robotics --env.task=AdroitHandDoor-v1 --env.episode_length=300 \
-    --eval.n_episodes=50 --eval.batch_size=10 --eval.use_async_envs=false --seed=100000 --output_dir="$output/eval"
+    --eval.n_episodes=50 --eval.batch_size=10 --eval.use_async_envs=false --env.shadows=false --seed=100000 --output_dir="$output/eval"
 python "$here/spread.py" "$last" "$root" "$output/spread.json"
