@@ -40,7 +40,7 @@ class ImportAdroitConfig:
     repo_id: str = "local/adroit"
     # Episodes to keep, e.g. "[0,1,2]"; default: all.
     episodes: list[int] | None = None
-    # Of these, keep all, or the successful: those that reach the environment's goal at some step of the replay.
+    # all, or successful: those that reach the environment's goal at some step of the replay.
     keep: Literal["all", "successful"] = "all"
     # Upload the dataset when it is done.
     push_to_hub: bool = False
