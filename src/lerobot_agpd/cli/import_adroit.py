@@ -27,6 +27,8 @@ logger = logging.getLogger(__name__)
 
 REPORT_PATH = Path("meta/dapg.json")
 
+Kept = Literal["all", "successful"]
+
 
 @dataclass
 class ImportAdroitConfig:
@@ -40,8 +42,8 @@ class ImportAdroitConfig:
     repo_id: str = "local/adroit"
     # Episodes to keep, e.g. "[0,1,2]"; default: all.
     episodes: list[int] | None = None
-    # all, or successful: those that reach the environment's goal at some step of the replay.
-    keep: Literal["all", "successful"] = "all"
+    # Of these, keep all, or the successful: those that reach the environment's goal at some step of the replay.
+    keep: Kept = "all"
     # Upload the dataset when it is done.
     push_to_hub: bool = False
 
