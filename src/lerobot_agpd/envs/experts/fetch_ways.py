@@ -1,0 +1,85 @@
+"""Scripted experts for the tasks of `envs.fetch_ways_tasks`: draw a way, then do as the experts for Fetch do.
+
+Which way an episode takes no observation shows at its start: the demonstrations know several.
+"""
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from lerobot_agpd.envs.experts.base import Array, Expert, Observation, state_vectors
+from lerobot_agpd.envs.experts.fetch import FetchScene, move, pick_and_place, push
+from lerobot_agpd.envs.experts.ways import CorrelatedNoise, WaysExpert
+from lerobot_agpd.envs.fetch_ways_tasks import TASKS, FetchWaysTask
+
+# Standard deviation of the noise on the motion, action units, and its correlation from one step to the next.
+NOISE = 0.02
+NOISE_CORRELATION = 0.8
+# Distance from the block at which the hand goes round it, and at which the next waypoint takes over, meters.
+DETOUR = 0.10
+WAYPOINT_RADIUS = 0.012
+
+type Follow = Callable[[Observation], Array]
+
+
+def _at_most(displacement: Array, length: float) -> Array:
+    """Shorten a displacement (3,) to a length."""
+    return displacement * min(1.0, length / max(float(np.linalg.norm(displacement)), 1e-6))
+
+
+def _scene(task: FetchWaysTask, observation: Observation, place: int) -> FetchScene:
+    """One observation by name, with the next point on the way to a place for a goal."""
+    agent_pos, state = state_vectors(observation, task.agent_pos_dim, task.environment_state_dim)
+    brought = agent_pos[:3] if task.block is None else state[:3]
+    ahead = _at_most(task.vectors(state)[place], task.stride)
+    return FetchScene(agent_pos[:3], float(agent_pos[3] + agent_pos[4]), brought, brought + ahead)
+
+
+def reach_place(task: FetchWaysTask, place: int, observation: Observation) -> Array:
+    """Go straight to a place; action (4,)."""
+    scene = _scene(task, observation, place)
+    return move(scene.goal - scene.grip, gripper=0.0).astype(np.float64)
+
+
+def bring_to_place(task: FetchWaysTask, place: int, observation: Observation) -> Array:
+    """Grasp the block and carry it straight to a place; action (4,)."""
+    return pick_and_place(_scene(task, observation, place)).astype(np.float64)
+
+
+class PushFromSide:
+    """Goes round the block to one side, to the far side of it from the place, and pushes."""
+
+    def __init__(self, task: FetchWaysTask, side: int) -> None:
+        """Begin an episode; `side` is the task's way."""
+        sign = 1.0 if side == 0 else -1.0
+        self._task = task
+        self._corners = [(0.03, sign * DETOUR), (-0.07, sign * DETOUR), (-0.07, 0.0)]  # from the block
+        self._next = 0
+
+    def __call__(self, observation: Observation) -> Array:
+        """Action (4,)."""
+        scene = _scene(self._task, observation, place=0)
+        while self._next < len(self._corners):
+            displacement = scene.block + np.array([*self._corners[self._next], 0.0]) - scene.grip
+            if np.linalg.norm(displacement[:2]) > WAYPOINT_RADIUS:
+                return move(_at_most(displacement, self._task.stride), gripper=0.0).astype(np.float64)
+            self._next += 1
+        return push(scene).astype(np.float64)
+
+
+def follow(task: str, way: int, rng: np.random.Generator) -> Expert:
+    """Expert that takes a way of a key of `fetch_ways_tasks.TASKS` for one episode."""
+    spec = TASKS[task]
+    ways: dict[str, Follow] = {
+        "reach": partial(reach_place, spec, way),
+        "pick_and_place": partial(bring_to_place, spec, way),
+        "push": PushFromSide(spec, way),
+    }
+    intend, noise = ways[spec.model], CorrelatedNoise(NOISE, NOISE_CORRELATION, 3, rng)
+    return Expert(lambda observation: intend(observation) + np.append(noise(), 0.0))
+
+
+EXPERTS: dict[str, WaysExpert] = {
+    name: WaysExpert(name, spec.n_ways, partial(follow, name)) for name, spec in TASKS.items()
+}
