@@ -87,14 +87,15 @@ def fetch_pick_and_place_expert(observation: dict[str, np.ndarray]) -> np.ndarra
     return pick_and_place(FetchScene.from_observation(observation))
 
 
-def pick_and_place(scene: FetchScene) -> np.ndarray:
-    """Action of `fetch_pick_and_place_expert`."""
+def pick_and_place(scene: FetchScene, approach: Array | None = None) -> np.ndarray:
+    """Action of `fetch_pick_and_place_expert`; `approach` is another displacement (3,) onto the block."""
     to_block = scene.block - scene.grip
     between_fingers = ramp(float(np.linalg.norm(to_block)), zero_at=0.035, one_at=0.020)
     held = between_fingers * ramp(scene.width, zero_at=0.058, one_at=0.052)
 
     fingers_shut = (1.0 - between_fingers) * ramp(scene.width, zero_at=0.09, one_at=0.07)
-    approach = descend(to_block, GRASP_CLEARANCE, fingers_shut)
+    if approach is None:
+        approach = descend(to_block, GRASP_CLEARANCE, fingers_shut)
     carry = scene.goal - scene.block
     gripper = OPEN + (CLOSE - OPEN) * between_fingers
     return move((1.0 - held) * approach + held * carry, gripper)

@@ -19,6 +19,11 @@ NOISE_CORRELATION = 0.8
 # Distance from the block at which the hand goes round it, and at which the next waypoint takes over, meters.
 DETOUR = 0.10
 WAYPOINT_RADIUS = 0.012
+# Height above the block per distance from it, and the distance at which the hand is down, meters.
+SLOPE = 2.1
+LINE_END = 0.005
+# How far above itself a hand that lifts a block aims, meters.
+LIFT_STRIDE = 0.05
 
 type Follow = Callable[[Observation], Array]
 
@@ -28,23 +33,36 @@ def _at_most(displacement: Array, length: float) -> Array:
     return displacement * min(1.0, length / max(float(np.linalg.norm(displacement)), 1e-6))
 
 
-def _scene(task: FetchWaysTask, observation: Observation, place: int) -> FetchScene:
-    """One observation by name, with the next point on the way to a place for a goal."""
-    agent_pos, state = state_vectors(observation, task.agent_pos_dim, task.environment_state_dim)
-    brought = agent_pos[:3] if task.block is None else state[:3]
-    ahead = _at_most(task.vectors(state)[place], task.stride)
-    return FetchScene(agent_pos[:3], float(agent_pos[3] + agent_pos[4]), brought, brought + ahead)
+def _intention(action: np.ndarray) -> Array:
+    return action.astype(np.float64)
 
 
 def reach_place(task: FetchWaysTask, place: int, observation: Observation) -> Array:
     """Go straight to a place; action (4,)."""
-    scene = _scene(task, observation, place)
-    return move(scene.goal - scene.grip, gripper=0.0).astype(np.float64)
+    _, vectors = state_vectors(observation, task.agent_pos_dim, task.environment_state_dim)
+    return _intention(move(_at_most(vectors.reshape(-1, 3)[place], task.stride), gripper=0.0))
 
 
-def bring_to_place(task: FetchWaysTask, place: int, observation: Observation) -> Array:
-    """Grasp the block and carry it straight to a place; action (4,)."""
-    return pick_and_place(_scene(task, observation, place)).astype(np.float64)
+def pick_block(task: FetchWaysTask, block: int, observation: Observation) -> Array:
+    """Come down onto a block on a straight steep line, grasp it and lift it; action (4,).
+
+    The line is steep enough for open fingers to pass the block's edges, and all lines begin where the hand starts: it
+    comes down whatever the block is.
+    """
+    agent_pos, state = state_vectors(observation, task.agent_pos_dim, task.environment_state_dim)
+    position = state.reshape(2, -1, 3)[0, block]
+    to_block = position - agent_pos[:3]
+    distance = float(np.linalg.norm(to_block[:2]))
+    stride = min(task.stride, distance)
+    across = to_block[:2] * stride / max(distance, 1e-6)
+    height = SLOPE * max(distance - stride - LINE_END, 0.0)
+    scene = FetchScene(
+        grip=agent_pos[:3],
+        width=float(agent_pos[3] + agent_pos[4]),
+        block=position,
+        goal=position + np.array([0.0, 0.0, LIFT_STRIDE]),
+    )
+    return _intention(pick_and_place(scene, approach=np.append(across, to_block[2] + height)))
 
 
 class PushFromSide:
@@ -59,13 +77,13 @@ class PushFromSide:
 
     def __call__(self, observation: Observation) -> Array:
         """Action (4,)."""
-        scene = _scene(self._task, observation, place=0)
+        scene = FetchScene.from_observation(observation)
         while self._next < len(self._corners):
             displacement = scene.block + np.array([*self._corners[self._next], 0.0]) - scene.grip
             if np.linalg.norm(displacement[:2]) > WAYPOINT_RADIUS:
-                return move(_at_most(displacement, self._task.stride), gripper=0.0).astype(np.float64)
+                return _intention(move(_at_most(displacement, self._task.stride), gripper=0.0))
             self._next += 1
-        return push(scene).astype(np.float64)
+        return _intention(push(scene))
 
 
 def follow(task: str, way: int, rng: np.random.Generator) -> Expert:
@@ -73,7 +91,7 @@ def follow(task: str, way: int, rng: np.random.Generator) -> Expert:
     spec = TASKS[task]
     ways: dict[str, Follow] = {
         "reach": partial(reach_place, spec, way),
-        "pick_and_place": partial(bring_to_place, spec, way),
+        "pick_and_place": partial(pick_block, spec, way),
         "push": PushFromSide(spec, way),
     }
     intend, noise = ways[spec.model], CorrelatedNoise(NOISE, NOISE_CORRELATION, 3, rng)
