@@ -16,12 +16,12 @@ from lerobot_agpd.envs.packages import require_packages
 @EnvConfig.register_subclass("fetch_ways")
 @dataclass
 class FetchWaysEnv(SimulatedEnvConfig):
-    """Fetch with several places or several sides to choose from, seen through its state or one camera."""
+    """Fetch with several places, blocks or sides to choose from, seen through its state or one camera."""
 
     tasks = TASKS
 
-    # Task: ReachAnyPlace-v0, PickAndPlaceAnyPlace-v0 or PushEitherSide-v0.
-    task: str | None = "PickAndPlaceAnyPlace-v0"
+    # Task: ReachAnyPlace-v0, PickAnyBlock-v0 or PushEitherSide-v0.
+    task: str | None = "PickAnyBlock-v0"
 
     def make_single(self) -> gym.Env:
         """Build one wrapped environment; see `SimulatedEnvConfig.make_single`."""

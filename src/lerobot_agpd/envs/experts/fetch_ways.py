@@ -25,7 +25,7 @@ LINE_END = 0.005
 # How far above itself a hand that lifts a block aims, meters.
 LIFT_STRIDE = 0.05
 
-type Follow = Callable[[Observation], Array]
+type Intend = Callable[[Observation], np.ndarray]
 
 
 def _at_most(displacement: Array, length: float) -> Array:
@@ -33,17 +33,13 @@ def _at_most(displacement: Array, length: float) -> Array:
     return displacement * min(1.0, length / max(float(np.linalg.norm(displacement)), 1e-6))
 
 
-def _intention(action: np.ndarray) -> Array:
-    return action.astype(np.float64)
-
-
-def reach_place(task: FetchWaysTask, place: int, observation: Observation) -> Array:
+def reach_place(task: FetchWaysTask, place: int, observation: Observation) -> np.ndarray:
     """Go straight to a place; action (4,)."""
     _, vectors = state_vectors(observation, task.agent_pos_dim, task.environment_state_dim)
-    return _intention(move(_at_most(vectors.reshape(-1, 3)[place], task.stride), gripper=0.0))
+    return move(_at_most(vectors.reshape(-1, 3)[place], task.stride), gripper=0.0)
 
 
-def pick_block(task: FetchWaysTask, block: int, observation: Observation) -> Array:
+def pick_block(task: FetchWaysTask, block: int, observation: Observation) -> np.ndarray:
     """Come down onto a block on a straight steep line, grasp it and lift it; action (4,).
 
     The line is steep enough for open fingers to pass the block's edges, and all lines begin where the hand starts: it
@@ -62,7 +58,7 @@ def pick_block(task: FetchWaysTask, block: int, observation: Observation) -> Arr
         block=position,
         goal=position + np.array([0.0, 0.0, LIFT_STRIDE]),
     )
-    return _intention(pick_and_place(scene, approach=np.append(across, to_block[2] + height)))
+    return pick_and_place(scene, approach=np.append(across, to_block[2] + height))
 
 
 class PushFromSide:
@@ -75,21 +71,21 @@ class PushFromSide:
         self._corners = [(0.03, sign * DETOUR), (-0.07, sign * DETOUR), (-0.07, 0.0)]  # from the block
         self._next = 0
 
-    def __call__(self, observation: Observation) -> Array:
+    def __call__(self, observation: Observation) -> np.ndarray:
         """Action (4,)."""
         scene = FetchScene.from_observation(observation)
         while self._next < len(self._corners):
             displacement = scene.block + np.array([*self._corners[self._next], 0.0]) - scene.grip
             if np.linalg.norm(displacement[:2]) > WAYPOINT_RADIUS:
-                return _intention(move(_at_most(displacement, self._task.stride), gripper=0.0))
+                return move(_at_most(displacement, self._task.stride), gripper=0.0)
             self._next += 1
-        return _intention(push(scene))
+        return push(scene)
 
 
 def follow(task: str, way: int, rng: np.random.Generator) -> Expert:
     """Expert that takes a way of a key of `fetch_ways_tasks.TASKS` for one episode."""
     spec = TASKS[task]
-    ways: dict[str, Follow] = {
+    ways: dict[str, Intend] = {
         "reach": partial(reach_place, spec, way),
         "pick_and_place": partial(pick_block, spec, way),
         "push": PushFromSide(spec, way),
