@@ -86,6 +86,12 @@ STUDIES = {
         inputs=(AGENT_POS, ENVIRONMENT_STATE),
         hand=(3, 2),
         settings=(
+            ("PickAndPlaceAnyPlace-v0", "L1", None, 120),
+            ("PickAndPlaceAnyPlace-v0", "L1", (0.0, 0.0, 1.0), 120),
+            ("PickAndPlaceAnyPlace-v0", "L1", (0.2, 0.2, 0.6), 120),
+            ("PickAndPlaceAnyPlace-v0", "L2", None, 120),
+            ("PickAndPlaceAnyPlace-v0", "L1", None, 20),
+            ("PickAndPlaceAnyPlace-v0", "L1", (0.0, 1.0, 0.0), 20),
             ("PickAnyBlock-v0", "L1", None, 120),
             ("PickAnyBlock-v0", "L1", (0.0, 0.0, 1.0), 120),
             ("PickAnyBlock-v0", "L1", (0.2, 0.2, 0.6), 120),

@@ -4,6 +4,7 @@ Positions are meters in Fetch's world: x leads away from the robot, y to its lef
 here needs a simulator.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -50,13 +51,17 @@ class FetchWaysTask(RoboticsTask, WaysTask):
 
 @dataclass(frozen=True, kw_only=True)
 class AnyPlaceTask(FetchWaysTask):
-    """Bring the gripper to a place: every place is a way. `environment_state`: the vectors to all places."""
+    """Bring the block, or without one the gripper, to a place: every place is a way.
+
+    `environment_state` is that of the task with one goal, and in the place of the goal the vectors to all places.
+    """
 
     def split(self, observation: RawObservation) -> tuple[np.ndarray, np.ndarray]:
         """Split one observation; see `RoboticsTask.split`."""
         assert isinstance(observation, dict)
-        agent_pos, places = super().split(observation)
-        return agent_pos, places - np.tile(observation["achieved_goal"], len(self.places))
+        agent_pos, environment_state = super().split(observation)
+        environment_state[-self.goal_dim :] -= np.tile(observation["achieved_goal"], len(self.places))
+        return agent_pos, environment_state
 
     @property
     def n_ways(self) -> int:
@@ -65,7 +70,11 @@ class AnyPlaceTask(FetchWaysTask):
 
     def way_of(self, agent_pos: Array, environment_state: Array) -> int:
         """Place that was nearest at the end; see `WaysTask.way_of`."""
-        return int(np.linalg.norm(environment_state[-1].reshape(-1, 3), axis=1).argmin())
+        return int(np.linalg.norm(self.vectors(environment_state[-1]), axis=1).argmin())
+
+    def vectors(self, environment_state: Array) -> Array:
+        """Vectors (N, 3) to the places, of an `environment_state` (environment_state_dim,)."""
+        return environment_state[-self.goal_dim :].reshape(-1, 3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,8 +116,16 @@ class EitherSideTask(FetchWaysTask):
         return int(sideways[np.abs(sideways).argmax()] < 0)
 
 
-# Around (1.342, 0.749), above which the hand starts. The middle of the second and the third is no block.
-_BLOCKS: tuple[Point, ...] = ((1.44, 0.75, 0.425), (1.27, 0.85, 0.425), (1.27, 0.65, 0.425))
+def _around(radius: float, height: float) -> tuple[Point, Point, Point]:
+    """Three points at one distance from where the hand starts, so that no way begins earlier than another.
+
+    One lies ahead, two behind on the left and right. Their coordinate-wise median lies between the last two.
+    """
+    x, y = 1.342, 0.749
+    back = 0.58 * radius
+    side = math.sqrt(radius**2 - back**2)
+    return (x + radius, y, height), (x - back, y + side, height), (x - back, y - side, height)
+
 
 TASKS: dict[str, FetchWaysTask] = {
     "ReachAnyPlace-v0": AnyPlaceTask(
@@ -127,12 +144,25 @@ TASKS: dict[str, FetchWaysTask] = {
         description="Pick up any of the blocks.",
         model="pick_and_place",
         hand_height=0.29,
-        blocks=_BLOCKS,
-        places=tuple((x, y, z + 0.1) for x, y, z in _BLOCKS),
+        blocks=_around(0.12, height=0.425),
+        places=_around(0.12, height=0.525),
         agent=ARM_AND_OBJECT[0],
         scene=(),
         environment_state_dim=18,
         episode_length=40,
+        stride=0.03,
+    ),
+    "PickAndPlaceAnyPlace-v0": AnyPlaceTask(
+        description="Pick up the block and put it down at any of the places.",
+        model="pick_and_place",
+        hand_height=0.2,
+        blocks=((1.342, 0.749, 0.425),),
+        places=_around(0.13, height=0.425),
+        agent=ARM_AND_OBJECT[0],
+        scene=ARM_AND_OBJECT[1],
+        environment_state_dim=24,
+        goal_dim=9,
+        episode_length=45,
         stride=0.03,
     ),
     "PushEitherSide-v0": EitherSideTask(

@@ -8,10 +8,10 @@ from functools import partial
 
 import numpy as np
 
-from lerobot_agpd.envs.experts.base import Array, Expert, Observation, state_vectors
+from lerobot_agpd.envs.experts.base import Array, Expert, Observation, ramp, state_vectors
 from lerobot_agpd.envs.experts.fetch import FetchScene, move, pick_and_place, push
 from lerobot_agpd.envs.experts.ways import CorrelatedNoise, WaysExpert
-from lerobot_agpd.envs.fetch_ways_tasks import TASKS, FetchWaysTask
+from lerobot_agpd.envs.fetch_ways_tasks import TASKS, AnyBlockTask, AnyPlaceTask, FetchWaysTask
 
 # Standard deviation of the noise on the motion, action units, and its correlation from one step to the next.
 NOISE = 0.02
@@ -19,7 +19,7 @@ NOISE_CORRELATION = 0.8
 # Distance from the block at which the hand goes round it, and at which the next waypoint takes over, meters.
 DETOUR = 0.10
 WAYPOINT_RADIUS = 0.012
-# Height above the block per distance from it, and the distance at which the hand is down, meters.
+# Height above the end of a line per distance from it, and the distance at which the hand is down, meters.
 SLOPE = 2.1
 LINE_END = 0.005
 # How far above itself a hand that lifts a block aims, meters.
@@ -33,32 +33,40 @@ def _at_most(displacement: Array, length: float) -> Array:
     return displacement * min(1.0, length / max(float(np.linalg.norm(displacement)), 1e-6))
 
 
-def reach_place(task: FetchWaysTask, place: int, observation: Observation) -> np.ndarray:
+def _down_the_line(displacement: Array, stride: float) -> Array:
+    """Displacement (3,) that comes down a steep straight line, which ends at a given one.
+
+    All lines to points at the same distance begin at the same height: above the middle of three points the hand comes
+    down whichever it goes to. The hand rises to the line before it moves across.
+    """
+    distance = float(np.linalg.norm(displacement[:2]))
+    below = SLOPE * max(distance - LINE_END, 0.0) + displacement[2]
+    across = ramp(below, zero_at=0.05, one_at=0.01) * min(stride, distance)
+    height = SLOPE * max(distance - across - LINE_END, 0.0)
+    return np.append(displacement[:2] * across / max(distance, 1e-6), displacement[2] + height)
+
+
+def reach_place(task: AnyPlaceTask, place: int, observation: Observation) -> np.ndarray:
     """Go straight to a place; action (4,)."""
     _, vectors = state_vectors(observation, task.agent_pos_dim, task.environment_state_dim)
-    return move(_at_most(vectors.reshape(-1, 3)[place], task.stride), gripper=0.0)
+    return move(_at_most(task.vectors(vectors)[place], task.stride), gripper=0.0)
 
 
-def pick_block(task: FetchWaysTask, block: int, observation: Observation) -> np.ndarray:
-    """Come down onto a block on a straight steep line, grasp it and lift it; action (4,).
+def place_block(task: AnyPlaceTask, place: int, observation: Observation) -> np.ndarray:
+    """Grasp the block, lift it and put it down at a place; action (4,)."""
+    agent_pos, state = state_vectors(observation, task.agent_pos_dim, task.environment_state_dim)
+    carry = _down_the_line(task.vectors(state)[place], task.stride)
+    scene = FetchScene(agent_pos[:3], float(agent_pos[3] + agent_pos[4]), state[:3], state[:3] + carry)
+    return pick_and_place(scene)
 
-    The line is steep enough for open fingers to pass the block's edges, and all lines begin where the hand starts: it
-    comes down whatever the block is.
-    """
+
+def pick_block(task: AnyBlockTask, block: int, observation: Observation) -> np.ndarray:
+    """Come down onto a block with open fingers, grasp it and lift it; action (4,)."""
     agent_pos, state = state_vectors(observation, task.agent_pos_dim, task.environment_state_dim)
     position = state.reshape(2, -1, 3)[0, block]
-    to_block = position - agent_pos[:3]
-    distance = float(np.linalg.norm(to_block[:2]))
-    stride = min(task.stride, distance)
-    across = to_block[:2] * stride / max(distance, 1e-6)
-    height = SLOPE * max(distance - stride - LINE_END, 0.0)
-    scene = FetchScene(
-        grip=agent_pos[:3],
-        width=float(agent_pos[3] + agent_pos[4]),
-        block=position,
-        goal=position + np.array([0.0, 0.0, LIFT_STRIDE]),
-    )
-    return pick_and_place(scene, approach=np.append(across, to_block[2] + height))
+    goal = position + np.array([0.0, 0.0, LIFT_STRIDE])
+    scene = FetchScene(agent_pos[:3], float(agent_pos[3] + agent_pos[4]), position, goal)
+    return pick_and_place(scene, approach=_down_the_line(position - agent_pos[:3], task.stride))
 
 
 class PushFromSide:
@@ -85,12 +93,14 @@ class PushFromSide:
 def follow(task: str, way: int, rng: np.random.Generator) -> Expert:
     """Expert that takes a way of a key of `fetch_ways_tasks.TASKS` for one episode."""
     spec = TASKS[task]
-    ways: dict[str, Intend] = {
-        "reach": partial(reach_place, spec, way),
-        "pick_and_place": partial(pick_block, spec, way),
-        "push": PushFromSide(spec, way),
-    }
-    intend, noise = ways[spec.model], CorrelatedNoise(NOISE, NOISE_CORRELATION, 3, rng)
+    intend: Intend
+    if isinstance(spec, AnyPlaceTask):
+        intend = partial(place_block if spec.blocks else reach_place, spec, way)
+    elif isinstance(spec, AnyBlockTask):
+        intend = partial(pick_block, spec, way)
+    else:
+        intend = PushFromSide(spec, way)
+    noise = CorrelatedNoise(NOISE, NOISE_CORRELATION, 3, rng)
     return Expert(lambda observation: intend(observation) + np.append(noise(), 0.0))
 
 
