@@ -80,7 +80,17 @@ def test_median_of_three_blocks_grasps_nothing():
             assert np.linalg.norm(blocks[lowest, 1, :, :2], axis=-1).min() > 0.06
 
 
-def test_median_of_three_places_stays_where_it_is():
+def test_median_of_three_places_brings_the_block_to_none():
+    env, spec = make("PickAndPlaceAnyPlace-v0"), TASKS["PickAndPlaceAnyPlace-v0"]
+    for average in (np.median, np.mean):
+        actions = average(all_ways(env, seed=0), axis=0).astype(np.float32)
+        episode, _, success = replay(env, actions, seed=0)
+        block = episode[ENVIRONMENT_STATE][:, :3]
+        assert not success and block[:, 2].max() > 0.55  # it was lifted
+        np.testing.assert_allclose(block[-1, 1], spec.blocks[0][1], atol=0.05)  # and came down in the middle
+
+
+def test_median_of_three_places_for_the_hand_stays_where_it_is():
     env = make("ReachAnyPlace-v0")
     actions = np.median(all_ways(env, seed=0), axis=0).astype(np.float32)
     episode, _, success = replay(env, actions, seed=0)
@@ -119,6 +129,11 @@ def test_environment_state_holds_places_and_blocks():
     places = observation[ENVIRONMENT_STATE].reshape(3, 3) + observation[AGENT_POS][:3]
     np.testing.assert_allclose(places, TASKS["ReachAnyPlace-v0"].places, atol=1e-6)
     assert info == {"is_success": False}
+
+    env = make("PickAndPlaceAnyPlace-v0")
+    scene = env.reset(seed=0)[0][ENVIRONMENT_STATE]
+    places = scene[-9:].reshape(3, 3) + scene[:3]
+    np.testing.assert_allclose(places, TASKS["PickAndPlaceAnyPlace-v0"].places, atol=1e-6)
 
     env = make("PickAnyBlock-v0")
     observation, _ = env.reset(seed=0)
