@@ -16,6 +16,7 @@ logger = logging.getLogger(__name__)
 
 ENV_TYPES = {
     "aloha_state": "lerobot_agpd.envs.aloha",
+    "fetch_ways": "lerobot_agpd.envs.fetch_ways",
     "gymnasium_robotics": "lerobot_agpd.envs.gymnasium_robotics",
     "point_maze_ways": "lerobot_agpd.envs.point_maze",
     "robosuite_robomimic": "lerobot_agpd.envs.robomimic",

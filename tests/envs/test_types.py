@@ -15,9 +15,10 @@ from lerobot.envs.utils import check_env_attributes_and_types, env_to_policy_fea
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_agpd.config import FlagError
-from lerobot_agpd.envs import aloha, gymnasium_robotics, point_maze, robomimic, robosuite_ways
+from lerobot_agpd.envs import aloha, fetch_ways, gymnasium_robotics, point_maze, robomimic, robosuite_ways
 from lerobot_agpd.envs.aloha import AlohaStateEnvConfig
 from lerobot_agpd.envs.base import ENVIRONMENT_STATE
+from lerobot_agpd.envs.fetch_ways import FetchWaysEnv
 from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
 from lerobot_agpd.envs.point_maze import PointMazeWaysEnv
 from lerobot_agpd.envs.robomimic import RobomimicEnvConfig
@@ -26,6 +27,7 @@ from lerobot_agpd.envs.robosuite_ways import RobosuiteWaysEnv
 KITCHEN = "FrankaKitchen-v1"
 MODULES = {
     AlohaStateEnvConfig: (aloha, "gym_aloha", "aloha"),
+    FetchWaysEnv: (fetch_ways, "gymnasium_robotics", "fetch"),
     GymnasiumRoboticsEnv: (gymnasium_robotics, "gymnasium_robotics", "fetch"),
     PointMazeWaysEnv: (point_maze, "gymnasium_robotics", "fetch"),
     RobomimicEnvConfig: (robomimic, "robosuite", "robomimic"),
@@ -36,6 +38,7 @@ MODULES = {
 QUICK = [
     (AlohaStateEnvConfig, "AlohaTransferCube-v0"),
     (AlohaStateEnvConfig, "AlohaInsertion-v0"),
+    *((FetchWaysEnv, task) for task in fetch_ways.TASKS),
     *((GymnasiumRoboticsEnv, task) for task in gymnasium_robotics.TASKS),
     *((PointMazeWaysEnv, task) for task in point_maze.TASKS),
     (RobosuiteWaysEnv, "LiftAny-v0"),
@@ -84,6 +87,7 @@ def test_gymnasium_env_checker_accepts_pixels(rendering, kind):
     [
         QUICK[0],
         QUICK[-1],
+        (FetchWaysEnv, "PickAnyBlock-v0"),
         (PointMazeWaysEnv, "Chain-v0"),
         *((GymnasiumRoboticsEnv, t) for t in ("FetchPush-v4", KITCHEN)),
     ],
@@ -129,6 +133,7 @@ def test_vector_env_agrees_with_the_declared_features(use_async_envs, kind, task
     ("kind", "options", "expected"),
     [
         (AlohaStateEnvConfig, ["task=AlohaInsertion-v0", "cameras=[angle]"], {"cameras": ["angle"], "fps": 50}),
+        (FetchWaysEnv, ["task=PushEitherSide-v0"], {"episode_length": 60, "fps": 25}),
         (GymnasiumRoboticsEnv, ["task=FetchPush-v4", "episode_length=7"], {"episode_length": 7, "fps": 25}),
         (GymnasiumRoboticsEnv, [f"task={KITCHEN}", "tasks_to_complete=[kettle]"], {"tasks_to_complete": ["kettle"]}),
         (PointMazeWaysEnv, ["task=Chain-v0", "obs_type=pixels"], {"episode_length": 130, "fps": 10}),
@@ -149,6 +154,7 @@ def test_command_line_and_round_trip(kind, options, expected):
     ("config", "episode_length", "cameras"),
     [
         (AlohaStateEnvConfig(), 400, ["top"]),
+        (FetchWaysEnv(), 40, []),
         (GymnasiumRoboticsEnv(), 50, []),
         (GymnasiumRoboticsEnv(task=KITCHEN), 280, []),
         (PointMazeWaysEnv(), 80, []),

@@ -59,4 +59,4 @@ class GymnasiumRoboticsEnv(SimulatedEnvConfig):
             render_mode=self.render_mode,
             **(kitchen if self.task == KITCHEN else {}),
         )
-        return RoboticsWrapper(env, str(self.task), self.view)
+        return RoboticsWrapper(env, str(self.task), TASKS[str(self.task)], self.view)

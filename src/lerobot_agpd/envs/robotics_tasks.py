@@ -45,7 +45,7 @@ class RoboticsTask(TaskSpec):
         return flat[list(self.agent)], np.concatenate([flat[list(self.scene)], goal])
 
 
-def _goal_reached(env: Any, observation: RawObservation, info: dict[str, Any]) -> bool:
+def goal_reached(env: Any, observation: RawObservation, info: dict[str, Any]) -> bool:
     """Fetch: the achieved goal lies within 5 cm of the desired one. Can be told after a reset, too."""
     assert isinstance(observation, dict)
     return bool(env._is_success(observation["achieved_goal"], observation["desired_goal"]))
@@ -72,7 +72,7 @@ def _fetch(description: str, agent: Sequence[int], scene: Sequence[int]) -> Robo
         agent=agent,
         scene=scene,
         goal_dim=3,
-        success=_goal_reached,
+        success=goal_reached,
     )
 
 
@@ -92,10 +92,10 @@ def _adroit(description: str, agent: Sequence[int], dim: int, action_dim: int) -
 
 
 # Grip position (3), finger displacements (2), grip velocity (3), finger velocities (2): an arm alone has these only.
-_ARM = (range(10), ())
+ARM = (range(10), ())
 # With an object, its position (3:6), position from the grip (6:9), rotation (11:14), velocity from the grip (14:17)
 # and angular velocity (17:20) lie between them.
-_ARM_AND_OBJECT = ((0, 1, 2, 9, 10, 20, 21, 22, 23, 24), (*range(3, 9), *range(11, 20)))
+ARM_AND_OBJECT = ((0, 1, 2, 9, 10, 20, 21, 22, 23, 24), (*range(3, 9), *range(11, 20)))
 
 KITCHEN = "FrankaKitchen-v1"
 KITCHEN_TASKS = (
@@ -111,12 +111,10 @@ KITCHEN_DEFAULT = ("microwave", "kettle", "light switch", "slide cabinet")
 """The four of D4RL's `kitchen-complete` (arXiv:2004.07219)."""
 
 TASKS: dict[str, RoboticsTask] = {
-    "FetchReach-v4": _fetch("Move the gripper to the target position.", *_ARM),
-    "FetchPush-v4": _fetch("Push the block to the target position on the table.", *_ARM_AND_OBJECT),
-    "FetchPickAndPlace-v4": _fetch(
-        "Pick up the block and bring it to the target position.", *_ARM_AND_OBJECT
-    ),
-    "FetchSlide-v4": _fetch("Hit the puck so that it slides to the target position.", *_ARM_AND_OBJECT),
+    "FetchReach-v4": _fetch("Move the gripper to the target position.", *ARM),
+    "FetchPush-v4": _fetch("Push the block to the target position on the table.", *ARM_AND_OBJECT),
+    "FetchPickAndPlace-v4": _fetch("Pick up the block and bring it to the target position.", *ARM_AND_OBJECT),
+    "FetchSlide-v4": _fetch("Hit the puck so that it slides to the target position.", *ARM_AND_OBJECT),
     # Arm, wrist and finger joints, and the position of the palm where it is observed; relocate observes the palm
     # only from the ball and from the target.
     "AdroitHandDoor-v1": _adroit(

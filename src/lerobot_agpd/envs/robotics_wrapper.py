@@ -8,7 +8,7 @@ import numpy as np
 
 from lerobot_agpd.envs.base import View
 from lerobot_agpd.envs.rendering import Camera, ViewedEnv
-from lerobot_agpd.envs.robotics_tasks import TASKS, RawObservation
+from lerobot_agpd.envs.robotics_tasks import RawObservation, RoboticsTask
 
 
 def configured_camera(simulation: Any) -> Camera:
@@ -34,16 +34,16 @@ def configured_camera(simulation: Any) -> Camera:
 
 
 class RoboticsWrapper(ViewedEnv, gym.Wrapper, gym.utils.RecordConstructorArgs):
-    """One task of `robotics_tasks.TASKS` with LeRobot's raw keys.
+    """One task of Gymnasium-Robotics, or of ours on its robots, with LeRobot's raw keys.
 
     `info["is_success"]` is a bool after every step and after a reset; `task` and `task_description` are attributes.
     """
 
-    def __init__(self, env: gym.Env, task: str, view: View) -> None:
-        """Wrap the environment made from the id `task`."""
-        gym.utils.RecordConstructorArgs.__init__(self, task=task, view=view)
+    def __init__(self, env: gym.Env, task: str, spec: RoboticsTask, view: View) -> None:
+        """Wrap the environment of the task named `task`."""
+        gym.utils.RecordConstructorArgs.__init__(self, task=task, spec=spec, view=view)
         gym.Wrapper.__init__(self, env)
-        self.task, self.spec_of_task = task, TASKS[task]
+        self.task, self.spec_of_task = task, spec
         self.set_view(view, self.spec_of_task)
         goal: Any = getattr(env.unwrapped, "goal", None)
         if isinstance(goal, dict):  # the kitchen, whose goal names the tasks

@@ -4,11 +4,12 @@ from collections.abc import Mapping
 
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_agpd.envs.experts import aloha, fetch, lift_any, point_maze, robomimic
+from lerobot_agpd.envs.experts import aloha, fetch, fetch_ways, lift_any, point_maze, robomimic
 from lerobot_agpd.envs.experts.base import Expert
 from lerobot_agpd.envs.experts.ways import WaysExpert
 
 EXPERTS: Mapping[str, Mapping[str, Expert | WaysExpert]] = {
+    "fetch_ways": fetch_ways.EXPERTS,
     "gymnasium_robotics": fetch.EXPERTS,
     "aloha_state": aloha.EXPERTS,
     "point_maze_ways": point_maze.EXPERTS,

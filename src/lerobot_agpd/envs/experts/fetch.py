@@ -53,7 +53,7 @@ class FetchScene:
         return cls(grip=agent[:3], width=float(agent[3] + agent[4]), block=scene[:3], goal=scene[-3:])
 
 
-def _action(displacement: Array, gripper: float) -> np.ndarray:
+def move(displacement: Array, gripper: float) -> np.ndarray:
     """Proportional action (4,) in [-1, 1], float32, for a displacement (3,) in meters."""
     return np.clip(np.append(POSITION_GAIN * displacement, gripper), -1.0, 1.0).astype(np.float32)
 
@@ -68,7 +68,7 @@ def fetch_reach_expert(observation: dict[str, np.ndarray]) -> np.ndarray:
         Action (4,) in [-1, 1], float32.
     """
     agent, goal = state_vectors(observation, 10, 3)
-    return _action(goal - agent[:3], gripper=0.0)
+    return move(goal - agent[:3], gripper=0.0)
 
 
 def fetch_pick_and_place_expert(observation: dict[str, np.ndarray]) -> np.ndarray:
@@ -84,16 +84,21 @@ def fetch_pick_and_place_expert(observation: dict[str, np.ndarray]) -> np.ndarra
     Returns:
         Action (4,) in [-1, 1], float32.
     """
-    scene = FetchScene.from_observation(observation)
+    return pick_and_place(FetchScene.from_observation(observation))
+
+
+def pick_and_place(scene: FetchScene, approach: Array | None = None) -> np.ndarray:
+    """Action of `fetch_pick_and_place_expert`; `approach` is another displacement (3,) onto the block."""
     to_block = scene.block - scene.grip
     between_fingers = ramp(float(np.linalg.norm(to_block)), zero_at=0.035, one_at=0.020)
     held = between_fingers * ramp(scene.width, zero_at=0.058, one_at=0.052)
 
     fingers_shut = (1.0 - between_fingers) * ramp(scene.width, zero_at=0.09, one_at=0.07)
-    approach = descend(to_block, GRASP_CLEARANCE, fingers_shut)
+    if approach is None:
+        approach = descend(to_block, GRASP_CLEARANCE, fingers_shut)
     carry = scene.goal - scene.block
     gripper = OPEN + (CLOSE - OPEN) * between_fingers
-    return _action((1.0 - held) * approach + held * carry, gripper)
+    return move((1.0 - held) * approach + held * carry, gripper)
 
 
 def fetch_push_expert(observation: dict[str, np.ndarray]) -> np.ndarray:
@@ -108,7 +113,11 @@ def fetch_push_expert(observation: dict[str, np.ndarray]) -> np.ndarray:
     Returns:
         Action (4,) in [-1, 1], float32.
     """
-    scene = FetchScene.from_observation(observation)
+    return push(FetchScene.from_observation(observation))
+
+
+def push(scene: FetchScene) -> np.ndarray:
+    """Action of `fetch_push_expert`."""
     to_goal = scene.goal[:2] - scene.block[:2]
     distance = float(np.linalg.norm(to_goal))
     forward = to_goal / max(distance, 1e-6)
@@ -129,11 +138,11 @@ def fetch_push_expert(observation: dict[str, np.ndarray]) -> np.ndarray:
     )
 
     travel = -PUSH_STANDOFF * forward - from_block
-    push = min(distance + behind - PUSH_CONTACT, PUSH_STRIDE) * forward - 2.0 * sideways
-    horizontal = (1.0 - pushing) * may_travel * travel + pushing * push
+    pushed = min(distance + behind - PUSH_CONTACT, PUSH_STRIDE) * forward - 2.0 * sideways
+    horizontal = (1.0 - pushing) * may_travel * travel + pushing * pushed
     vertical = PUSH_CLEARANCE * (1.0 - in_line) - above
     away_from_goal = ramp(distance, zero_at=0.015, one_at=0.03)
-    return _action(away_from_goal * np.append(horizontal, vertical), gripper=0.0)
+    return move(away_from_goal * np.append(horizontal, vertical), gripper=0.0)
 
 
 EXPERTS: dict[str, Expert] = {

@@ -9,7 +9,7 @@ import numpy as np
 
 from lerobot_agpd.envs.base import AGENT_POS
 from lerobot_agpd.envs.experts.base import Array, Expert, Observation
-from lerobot_agpd.envs.experts.ways import WaysExpert
+from lerobot_agpd.envs.experts.ways import CorrelatedNoise, WaysExpert
 from lerobot_agpd.envs.maze_tasks import TASKS
 
 # Acceleration at an action of 1 of PointMaze's ball of 4.19 kg with a gear of 100, m/s^2.
@@ -36,9 +36,8 @@ class WayFollower:
         """
         self._waypoints = waypoints
         self._speed = speed
-        self._rng = rng
         self._next = 0
-        self._noise: Array = np.zeros(2)
+        self._noise = CorrelatedNoise(NOISE, NOISE_CORRELATION, 2, rng)
 
     def __call__(self, observation: Observation) -> Array:
         """Intention (4,): force in x and y, and two zeros."""
@@ -51,15 +50,10 @@ class WayFollower:
             self._next += 1
         heading = (self._waypoints[self._next] - position) / max(self._distance(position), 1e-6)
         force = (self._speed * heading - velocity) / (VELOCITY_TIME * ACCELERATION)
-        return np.append(force + self._next_noise(), np.zeros(2))
+        return np.append(force + self._noise(), np.zeros(2))
 
     def _distance(self, position: Array) -> float:
         return float(np.linalg.norm(self._waypoints[self._next] - position))
-
-    def _next_noise(self) -> Array:
-        innovation = NOISE * np.sqrt(1.0 - NOISE_CORRELATION**2)
-        self._noise = NOISE_CORRELATION * self._noise + innovation * self._rng.standard_normal(2)
-        return self._noise
 
 
 def ball_position(observation: Observation) -> Array:

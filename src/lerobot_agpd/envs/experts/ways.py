@@ -7,7 +7,24 @@ from typing import Self
 import numpy as np
 
 from lerobot_agpd.config import require
-from lerobot_agpd.envs.experts.base import Expert
+from lerobot_agpd.envs.experts.base import Array, Expert
+
+
+class CorrelatedNoise:
+    """Normal noise whose values resemble each other from one step to the next, as the hand of a person trembles."""
+
+    def __init__(self, std: float, correlation: float, dim: int, rng: np.random.Generator) -> None:
+        """Begin an episode; `correlation` is that of one step with the next."""
+        self._innovation = std * np.sqrt(1.0 - correlation**2)
+        self._correlation, self._rng = correlation, rng
+        self._value: Array = np.zeros(dim)
+
+    def __call__(self) -> Array:
+        """Noise (dim,) of the next step."""
+        self._value = self._correlation * self._value + self._innovation * self._rng.standard_normal(
+            len(self._value)
+        )
+        return self._value
 
 
 @dataclass(frozen=True)
