@@ -154,7 +154,7 @@ def test_command_line_and_round_trip(kind, options, expected):
     ("config", "episode_length", "cameras"),
     [
         (AlohaStateEnvConfig(), 400, ["top"]),
-        (FetchWaysEnv(), 40, []),
+        (FetchWaysEnv(), 32, []),
         (GymnasiumRoboticsEnv(), 50, []),
         (GymnasiumRoboticsEnv(task=KITCHEN), 280, []),
         (PointMazeWaysEnv(), 80, []),

@@ -20,8 +20,8 @@ class FetchWaysEnv(SimulatedEnvConfig):
 
     tasks = TASKS
 
-    # Task: ReachAnyPlace-v0, PickAnyBlock-v0 or PushEitherSide-v0.
-    task: str | None = "PickAnyBlock-v0"
+    # Task: PickAndPlaceAnyPlace-v0, PickAnyBlock-v0, ReachAnyPlace-v0 or PushEitherSide-v0.
+    task: str | None = "PickAndPlaceAnyPlace-v0"
 
     def make_single(self) -> gym.Env:
         """Build one wrapped environment; see `SimulatedEnvConfig.make_single`."""

@@ -35,6 +35,7 @@ class FetchWaysTask(RoboticsTask, WaysTask):
         hand_height: Fetch's `gripper_extra_height`: above the table by so much and a little more the hand starts.
         blocks: where the blocks start, of which any may be brought.
         places: of which any is the goal.
+        slope: of the expert's way down to a block or a place, height per distance.
         stride: how far ahead of itself the expert aims at most on its way; this bounds its speed.
     """
 
@@ -43,6 +44,7 @@ class FetchWaysTask(RoboticsTask, WaysTask):
     blocks: tuple[Point, ...] = ()
     places: tuple[Point, ...]
     stride: float
+    slope: float = 0.0
     fps: int = 25
     action_dim: int = 4
     agent_pos_dim: int = 10
@@ -151,19 +153,21 @@ TASKS: dict[str, FetchWaysTask] = {
         environment_state_dim=18,
         episode_length=40,
         stride=0.03,
+        slope=2.1,
     ),
     "PickAndPlaceAnyPlace-v0": AnyPlaceTask(
         description="Pick up the block and put it down at any of the places.",
         model="pick_and_place",
         hand_height=0.2,
         blocks=((1.342, 0.749, 0.425),),
-        places=_around(0.13, height=0.425),
+        places=_around(0.16, height=0.425),
         agent=ARM_AND_OBJECT[0],
         scene=ARM_AND_OBJECT[1],
         environment_state_dim=24,
         goal_dim=9,
-        episode_length=45,
-        stride=0.03,
+        episode_length=32,
+        stride=0.05,
+        slope=1.3,
     ),
     "PushEitherSide-v0": EitherSideTask(
         description="Go round the block and push it to the place.",

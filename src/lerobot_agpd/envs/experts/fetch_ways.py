@@ -19,8 +19,7 @@ NOISE_CORRELATION = 0.8
 # Distance from the block at which the hand goes round it, and at which the next waypoint takes over, meters.
 DETOUR = 0.10
 WAYPOINT_RADIUS = 0.012
-# Height above the end of a line per distance from it, and the distance at which the hand is down, meters.
-SLOPE = 2.1
+# Distance from the end of the way down at which the hand is down, meters.
 LINE_END = 0.005
 # How far above itself a hand that lifts a block aims, meters.
 LIFT_STRIDE = 0.05
@@ -33,16 +32,16 @@ def _at_most(displacement: Array, length: float) -> Array:
     return displacement * min(1.0, length / max(float(np.linalg.norm(displacement)), 1e-6))
 
 
-def _down_the_line(displacement: Array, stride: float) -> Array:
+def _down_the_line(displacement: Array, task: FetchWaysTask) -> Array:
     """Displacement (3,) that comes down a steep straight line, which ends at a given one.
 
     All lines to points at the same distance begin at the same height: above the middle of three points the hand comes
     down whichever it goes to. The hand rises to the line before it moves across.
     """
     distance = float(np.linalg.norm(displacement[:2]))
-    below = SLOPE * max(distance - LINE_END, 0.0) + displacement[2]
-    across = ramp(below, zero_at=0.05, one_at=0.01) * min(stride, distance)
-    height = SLOPE * max(distance - across - LINE_END, 0.0)
+    below = task.slope * max(distance - LINE_END, 0.0) + displacement[2]
+    across = ramp(below, zero_at=0.05, one_at=0.01) * min(task.stride, distance)
+    height = task.slope * max(distance - across - LINE_END, 0.0)
     return np.append(displacement[:2] * across / max(distance, 1e-6), displacement[2] + height)
 
 
@@ -55,7 +54,7 @@ def reach_place(task: AnyPlaceTask, place: int, observation: Observation) -> np.
 def place_block(task: AnyPlaceTask, place: int, observation: Observation) -> np.ndarray:
     """Grasp the block, lift it and put it down at a place; action (4,)."""
     agent_pos, state = state_vectors(observation, task.agent_pos_dim, task.environment_state_dim)
-    carry = _down_the_line(task.vectors(state)[place], task.stride)
+    carry = _down_the_line(task.vectors(state)[place], task)
     scene = FetchScene(agent_pos[:3], float(agent_pos[3] + agent_pos[4]), state[:3], state[:3] + carry)
     return pick_and_place(scene)
 
@@ -66,7 +65,7 @@ def pick_block(task: AnyBlockTask, block: int, observation: Observation) -> np.n
     position = state.reshape(2, -1, 3)[0, block]
     goal = position + np.array([0.0, 0.0, LIFT_STRIDE])
     scene = FetchScene(agent_pos[:3], float(agent_pos[3] + agent_pos[4]), position, goal)
-    return pick_and_place(scene, approach=_down_the_line(position - agent_pos[:3], task.stride))
+    return pick_and_place(scene, approach=_down_the_line(position - agent_pos[:3], task))
 
 
 class PushFromSide:
