@@ -4,7 +4,8 @@
     every `collect.every` training steps
         stage 1   A_hat = pi_phi(O)                             Eq. 19      GuidedStrategy.act
                   A ~ teacher, its denoising pulled to A_hat    Eq. 20      GuidedStrategy.act
-                  execute A, keep what succeeds: T += episode               AGPD.collect_round
+                  execute A, keep what succeeds                             AGPD.collect_round
+                  T += kept episodes                                        AGPD.grow
                   adapt the pull                                            next_strength
     every training step
         stage 2   minimize L_IL + s * L_AIL on T                Eq. 21-22   AGPD.losses
@@ -26,12 +27,14 @@ LeRobot's own training loop drives it, through policies/distilled.py; build.py p
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from accelerate import PartialState
+from accelerate.utils import broadcast_object_list
 from lerobot.utils.constants import ACTION
 from lerobot.utils.random_utils import seeded_context
 from torch import Tensor
@@ -39,6 +42,7 @@ from torch import Tensor
 from lerobot_agpd.adversary import AdversaryBatch, Discriminator, adversary_terms
 from lerobot_agpd.build import Parts
 from lerobot_agpd.config import CollectConfig, GuidanceConfig, StudentConfig
+from lerobot_agpd.continuation import announcement
 from lerobot_agpd.guidance.guide import Guide
 from lerobot_agpd.guidance.representation import WEIGHT, reconstruction_loss
 from lerobot_agpd.guidance.strength import first_strength, guidance_scale, guidance_scales, largest_strength
@@ -59,6 +63,8 @@ from lerobot_agpd.rollout.strategies import (
 )
 from lerobot_agpd.rollout.success import classify
 from lerobot_agpd.student import PriorChunk, Student, StudentSampler
+
+logger = logging.getLogger(__name__)
 
 GROWTH = 2.0
 """Factor by which the strength of guidance grows after a good round and shrinks after a bad one."""
@@ -126,7 +132,8 @@ def next_strength(
 
     A round is good if guided episodes succeed as often as the teacher's own, up to TOLERANCE; then the strength grows
     by GROWTH, else it shrinks by the same factor. While the student is weak its pull costs success and the strength
-    stays small; as the student improves the strength rises.
+    stays small; as the student improves the strength rises. Where nothing succeeds nothing is
+    known, and it stays.
 
     Args:
         strength: of the finished round.
@@ -138,6 +145,8 @@ def next_strength(
     if guided_success is None or teacher_success is None:
         return strength
     if not config.adaptive or config.first_strength == 0:
+        return strength
+    if guided_success == teacher_success == 0:
         return strength
     if guided_success >= teacher_success - TOLERANCE:
         return max(strength, min(strength * GROWTH, config.max_strength, reachable))
@@ -185,7 +194,7 @@ class AGPD:
     # ---- the alternation ----
 
     def after_update(self) -> bool:
-        """Count an optimizer step, and collect if a round is due; runs on every process.
+        """Count an optimizer step, and grow T if a round is due; runs on every process.
 
         Returns:
             Whether this was the last step of the run.
@@ -194,10 +203,26 @@ class AGPD:
         self.progress.seen_episodes = sorted(self.replay.seen_episodes)
         due = rounds_due(self.progress.step, self.config.collect)
         is_last = self.progress.step + self.run.steps_per_update > (self.run.steps or math.inf)
-        # None after the last step, because no student would learn from it; none twice, if a killed run has it already.
+        # None after the last step, because no student would learn from it.
         if due > rounds_due(before, self.config.collect) and due > len(self.reports) and not is_last:
-            self.collect_round()
+            self.grow()
         return is_last
+
+    def grow(self) -> RoundReport:
+        """Add the next round to T: one that a killed run had finished is used again, any other is collected."""
+        assert self.journal is not None
+        number = len(self.reports)
+        again = self.journal.is_finished(number)
+        if not again:
+            self.collect_round(number)
+        elif self.self_teacher is not None:
+            self.teacher = self.self_teacher.refresh(self.replay.demonstrations.normalizer.stats)
+        self.replay.extend(self.journal.kept(number))  # T += episodes
+        self.reports.append(read_reports(self.journal.root)[number])
+        self.progress.rounds = len(self.reports)
+        if PartialState().is_main_process:
+            log_round(self.reports[-1], again)
+        return self.reports[-1]
 
     # ---- stage 1 ----
 
@@ -209,32 +234,28 @@ class AGPD:
         assert self.teacher is not None
         return first_strength(self.teacher, self.config.guidance)
 
-    def collect_round(self) -> RoundReport:
-        """One round: every process rolls out its part, successes become part of T."""
+    def collect_round(self, number: int) -> None:
+        """One round into the journal: every process rolls out its part and keeps what succeeds."""
         assert self.collector is not None and self.journal is not None
-        number, was_training = len(self.reports), self.student.training
+        processes, was_training = PartialState(), self.student.training
+        if not self.reports and self.run.output_dir and processes.is_main_process:
+            logger.info(announcement(self.run.output_dir, self.journal.root))
         self.student.eval()
         with seeded_context(self.collector.stream_seed(number, STUDENT_NOISE_STREAM)):
             strategy = self._strategy(number)
             strength = self._episode_strength()
-            done = {record.number for record in self.journal.records(number, self.rank)}
+            # What rank 0 finds, before any process adds to it: every process must share out the same rest.
+            (done,) = broadcast_object_list([{record.number for record in self.journal.records(number)}])
             for episode in self.collector.roll_out(number, strength, strategy, done):  # execute
                 with strategy.stopwatch.measure("writing"):
                     record = classify(episode, self.config.collect)  # success filter
                     self.journal.append(number, self.rank, episode, record)
-        processes = PartialState()
         processes.wait_for_everyone()
         self.collector.require_valid_episodes(number)
         if processes.is_main_process:
             self.journal.finish(number, self._report(number, strength, strategy).to_json())
         self.student.train(was_training)
         processes.wait_for_everyone()
-        self.replay.extend(self.journal.kept(number))  # T += episodes
-        self.reports.append(read_reports(self.journal.root)[number])
-        self.progress.rounds = len(self.reports)
-        if processes.is_main_process:
-            log_round(self.reports[-1])
-        return self.reports[-1]
 
     def _strategy(self, number: int) -> Strategy:
         """The configured strategy for a round, with the teacher and the student as they are now."""

@@ -215,8 +215,10 @@ def _identity(config: StudentConfig, env_config: EnvConfig, seed: int) -> dict[s
         "collect.keep_failures": collect.keep_failures,
     }
     if collect.guides:
-        identity["guidance.at"] = config.guidance.at
         identity["guidance.strength"] = config.guidance.unit
+        identity |= {f"guidance.{name}": value for name, value in asdict(config.guidance).items()}
+    if collect.guides or collect.strategy == "nearest":
+        identity["representation.type"] = config.representation.type
     if collect.strategy == "mixing":
         identity["collect.mixing"] = asdict(collect.mixing)
     if collect.strategy == "nearest":
@@ -227,7 +229,7 @@ def _identity(config: StudentConfig, env_config: EnvConfig, seed: int) -> dict[s
 def _adopt_rounds(
     journal: EpisodeJournal | None, replay: Replay, progress: Progress
 ) -> tuple[RoundReport, ...]:
-    """Take the finished rounds into T: those of the checkpoint, and those finished after it was written."""
+    """Take the checkpoint's rounds into T; those finished after it enter T when their step comes again."""
     if journal is None:
         return ()
     reports = tuple(read_reports(journal.root))
@@ -236,12 +238,17 @@ def _adopt_rounds(
             f"the checkpoint has used {progress.rounds} collection rounds, {journal.root} holds {len(reports)}; point "
             "--policy.replay.root at the run's folder of collected episodes"
         )
-    for report in reports:
+    used, later = reports[: progress.rounds], reports[progress.rounds :]
+    for report in used:
         replay.extend(journal.kept(report.round))
-    progress.rounds = len(reports)
     if reports:
-        logger.info("T holds %d finished rounds of %s", len(reports), journal.root)
-    return reports
+        logger.info(
+            "T holds %d finished rounds of %s; %d more are used again when training reaches them",
+            len(used),
+            journal.root,
+            len(later),
+        )
+    return used
 
 
 def _check_steps(student: Student, teacher: Teacher | None, demonstrations: DemonstrationFrames) -> None:

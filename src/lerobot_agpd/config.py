@@ -210,6 +210,10 @@ class CollectConfig:
     n_envs: int = 16
     # Step them in worker processes: worth it for slow rendering and many cores.
     use_async_envs: bool = False
+    # Seconds that a reset or step may take. Then an environment in a worker process is given up, another warned of.
+    step_timeout: float = 60.0
+    # Steps after which an episode that its environment has not ended is cut off; default: the environment's own limit.
+    max_episode_steps: int | None = None
     # Fraction of a round in which the teacher acts alone, to know its own success rate.
     teacher_only_fraction: float = 0.2
     # Largest fraction of a round that starts again where the earlier rounds' episodes have failed.
@@ -230,6 +234,13 @@ class CollectConfig:
     def __post_init__(self) -> None:
         require_finite(self, "collect")
         require(self.every >= 0, f"--policy.collect.every must not be negative, got {self.every}")
+        require(
+            self.step_timeout > 0, f"--policy.collect.step_timeout must be positive, got {self.step_timeout}"
+        )
+        require(
+            self.max_episode_steps is None or self.max_episode_steps >= 1,
+            f"--policy.collect.max_episode_steps must be at least 1, got {self.max_episode_steps}",
+        )
         for name in ("warmup", "episodes", "n_envs"):
             value = getattr(self, name)
             require(value >= 1, f"--policy.collect.{name} must be at least 1, got {value}")

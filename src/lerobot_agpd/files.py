@@ -90,6 +90,16 @@ def append_line(path: Path, line: str) -> None:
         _sync_folder(path.parent)
 
 
+def trim_incomplete_line(path: Path) -> None:
+    """Remove an incomplete last line, left by a killed process, from a file that nobody writes."""
+    with path.open("rb+") as file:
+        size = file.seek(0, os.SEEK_END)
+        complete = _complete_bytes(file)
+        if complete < size:
+            file.truncate(complete)
+            os.fsync(file.fileno())
+
+
 def _complete_bytes(file: BinaryIO) -> int:
     """Size of a file without its incomplete last line."""
     size = file.seek(0, os.SEEK_END)

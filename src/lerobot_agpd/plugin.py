@@ -7,10 +7,14 @@ import fails: without the guard a clash of one name would cost all types.
 import importlib
 import logging
 import multiprocessing
+import os
+import sys
 from collections.abc import Mapping
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
+
+from lerobot_agpd.continuation import advice
 
 logger = logging.getLogger(__name__)
 
@@ -30,7 +34,12 @@ POLICY_TYPES = {
 }
 """`--policy.type` to the module that registers it."""
 
-FORKSERVER_PRELOAD = ["lerobot_agpd.envs.workers", "lerobot_agpd.plugin", "gymnasium_robotics"]
+FORKSERVER_PRELOAD = [
+    "lerobot_agpd.envs.orphans",
+    "lerobot_agpd.envs.workers",
+    "lerobot_agpd.plugin",
+    "gymnasium_robotics",
+]
 """Modules that the forkserver of LeRobot's environment workers imports once, instead of every worker: most of a
 worker's start is LeRobot's imports. What is not installed is skipped."""
 
@@ -64,6 +73,15 @@ def register(
             logger.warning("%s=%s of lerobot_policy_agpd is not available", flag, name, exc_info=True)
 
 
+def warn_of_refused_command() -> None:
+    """Say what a `lerobot-train` command that LeRobot is about to refuse should have been."""
+    is_main_process = multiprocessing.parent_process() is None and os.environ.get("RANK", "0") == "0"
+    text = advice(sys.argv) if is_main_process else None
+    if text is not None:
+        logger.warning(text)
+
+
 register("--env.type", EnvConfig, ENV_TYPES)
 register("--policy.type", PreTrainedConfig, POLICY_TYPES)
+warn_of_refused_command()
 multiprocessing.set_forkserver_preload(FORKSERVER_PRELOAD)

@@ -11,7 +11,7 @@ from typing import Any
 
 from accelerate.utils import broadcast_object_list
 
-from lerobot_agpd.config import StudentConfig
+from lerobot_agpd.config import StudentConfig, require
 from lerobot_agpd.files import read_json
 from lerobot_agpd.run import RunInfo
 
@@ -78,19 +78,38 @@ class Progress:
 def find_replay_root(config: StudentConfig, run: RunInfo, progress: Progress) -> Path:
     """Folder of the collected episodes, the same on every process.
 
-    `--policy.replay.root` if given. A resumed run looks beside its checkpoint first, since runs get moved, then
-    where it was. Otherwise `<output_dir>/agpd`; without a run, a new folder.
+    `--policy.replay.root` if given. A resumed run has it beside its checkpoint, wherever the two were moved; if its own
+    output folder is another one, the folder is noted in `config`, so that the checkpoints to come know it. Otherwise
+    `<output_dir>/agpd`; without a run, a new folder.
+
+    Raises:
+        FlagError: if the checkpoint is a copy that left its episodes behind.
     """
     if config.replay.root:
         return Path(config.replay.root)
+    parent = run.output_dir
     if progress.checkpoint is not None:
         # <output_dir>/checkpoints/<step>/pretrained_model
-        beside = progress.checkpoint.resolve().parents[2] / REPLAY_FOLDER
+        checkpoint = progress.checkpoint.resolve()
+        run_folder = [*checkpoint.parents][:3][-1]
+        if parent is not None and parent.resolve() != run_folder:
+            logger.warning(
+                "the run of %s goes on, and its next checkpoints go to %s; pass --output_dir=%s to keep them together",
+                checkpoint,
+                parent,
+                run_folder,
+            )
+        beside, recorded = run_folder / REPLAY_FOLDER, progress.replay_root
         if beside.is_dir():
+            if parent is None or parent.resolve() != run_folder:
+                config.replay.root = str(beside)
             return beside
-        if progress.replay_root and Path(progress.replay_root).is_dir():
-            return Path(progress.replay_root)
-    parent = run.output_dir
+        require(
+            recorded is None or not Path(recorded).is_dir(),
+            f"the collected episodes of {checkpoint} are not beside it (there is no {beside}). The folder {recorded} "
+            "belongs to the run that it was copied from: copy it there, or pass "
+            f"--policy.replay.root={recorded} to use it, and to write to it",
+        )
     if parent is None:
         parent = Path("outputs/agpd") / f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
         logger.info("collected episodes go to %s", parent / REPLAY_FOLDER)

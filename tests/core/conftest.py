@@ -4,13 +4,14 @@ from pathlib import Path
 
 import pytest
 import torch
+import toy_run
 from lerobot.policies import make_pre_post_processors
 from point_environment import PointEnv, PointTeacher, demonstrate
 from small_dataset import create_dataset
 from toy_run import EPISODES, ROUND_STEPS, SCALE, STEPS, TEACHER_ONLY, Run
 
 from lerobot_agpd import build as builders
-from lerobot_agpd.config import AdversaryConfig, CollectConfig, GuidanceConfig, TeacherConfig
+from lerobot_agpd.config import AdversaryConfig, CollectConfig, GuidanceConfig, ReplayConfig, TeacherConfig
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
     DiffusionTransformerConfig,
@@ -101,9 +102,11 @@ def toy_teacher(monkeypatch):
 def start(agpd_config, point_demonstrations, toy_teacher, tmp_path):
     """Starts a run with the toy teacher, or continues one from its checkpoint; `facts` are those of the run."""
 
-    def start(checkpoint=None, collect=None, guidance=None, **facts) -> Run:
+    def start(checkpoint=None, collect=None, guidance=None, root=None, **facts) -> Run:
         torch.manual_seed(0)
         config = agpd_config(
+            **toy_run.STUDENT,
+            replay=ReplayConfig(root and str(root)),
             teacher=TeacherConfig(path="a/toy"),
             guidance=GuidanceConfig(**{"scale": SCALE, **(guidance or {})}),
             adversary=AdversaryConfig(start=2),

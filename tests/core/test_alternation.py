@@ -1,12 +1,13 @@
 """The alternation: warm-up, rounds, T grows, the scale adapts; several processes, gradient accumulation."""
 
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from point_environment import EPISODE_LENGTH, PointEnv
+from point_environment import EPISODE_LENGTH, Point, PointEnv
 from toy_run import EPISODES, ROUND_STEPS, SCALE, STEPS, TEACHER_ONLY, episodes_on_disk
 
 from lerobot_agpd import agpd as algorithm, build as builders
@@ -75,7 +76,7 @@ def test_a_round_leaves_random_numbers_and_mode_as_they_were(start):
     for mode in (True, False):
         run.policy.train(mode)
         before = torch.get_rng_state()
-        run.agpd.collect_round()
+        run.agpd.grow()
         assert torch.equal(torch.get_rng_state(), before) and run.policy.training is mode
 
 
@@ -123,6 +124,29 @@ def test_a_learned_discrepancy_guides_too(start, point_demonstrations, agpd_conf
     assert report.mean_guidance_shift > 0 and run.logs[-1]["representation_loss"] > 0
 
 
+def test_an_environment_that_is_solved_from_the_start_is_not_the_teachers_fault(start, monkeypatch, caplog):
+    reset = Point.reset
+
+    def reset_at_the_goal(self, **options):
+        _, info = reset(self, **options)
+        self.position = self.position * 0.1
+        return self.observation(), info
+
+    monkeypatch.setattr(Point, "reset", reset_at_the_goal)
+    run = start().train(until=3)
+    assert run.agpd.reports[0].total.solved_at_start == EPISODES
+    (warning,) = [r.getMessage() for r in caplog.records if "kept no episode" in r.getMessage()]
+    assert f"all {EPISODES} were solved at the start" in warning and "weak" not in warning
+    assert run.agpd.scale == SCALE
+
+
+def test_an_environment_that_never_succeeds_leaves_the_guidance_as_it_is(start, monkeypatch, caplog):
+    monkeypatch.setattr("point_environment.REACHED", -1.0)
+    run = start().train(until=6)
+    assert [report.total.successful for report in run.agpd.reports] == [0, 0] and run.agpd.scale == SCALE
+    assert "the teacher is too weak or the success filter too strict" in caplog.text
+
+
 def test_the_next_round_starts_again_where_the_last_one_failed(start, monkeypatch):
     failing, classify = set(), algorithm.classify
 
@@ -159,28 +183,63 @@ def test_a_failed_upload_does_not_end_the_training(start, caplog):
 # ---- several processes ----
 
 
-def test_processes_collect_parts_of_a_round(start, point_demonstrations):
-    """Both parts are those of one round, from different starts with different noise."""
-    agpd = start().agpd
-    collectors = [
-        Collector(
-            agpd.config, PointEnv(), point_demonstrations.meta, agpd.journal, lambda _: None, 7, rank, 2
+class Process:
+    """One of several processes that share a round, in turns in this one."""
+
+    def __init__(self, agpd, demonstrations, rank, n_ranks):
+        self.agpd, self.rank, config = agpd, rank, agpd.config
+        self.collector = Collector(
+            config, PointEnv(), demonstrations.meta, agpd.journal, lambda _: None, 7, rank, n_ranks
         )
-        for rank in (0, 1)
+        self.sampler = StudentSampler(agpd.student, Normalizer(config, demonstrations.meta.stats))
+
+    def collect(self, done, at_most=EPISODES):
+        """Roll out this process's part of what is not done, and append up to so many episodes."""
+        strategy = make_strategy(
+            self.agpd.config, self.sampler.pair_with(self.agpd.teacher), self.collector.noise(0)
+        )
+        for episode in islice(self.collector.roll_out(0, SCALE, strategy, done), at_most):
+            record = algorithm.classify(episode, self.agpd.config.collect)
+            self.agpd.journal.append(0, self.rank, episode, record)
+
+
+def test_processes_collect_parts_of_a_round(start, point_demonstrations):
+    """Together they collect the episodes of one process, each with noise of its own."""
+    agpd = start().agpd
+    processes = [Process(agpd, point_demonstrations, rank, 2) for rank in (0, 1)]
+    for process in processes:
+        process.collect(done=())
+    records = agpd.journal.records(0)
+    specs = Process(agpd, point_demonstrations, 0, 1).collector.specs(0, SCALE)
+    assert [(r.number, r.seed, r.strength) for r in records] == [
+        (s.number, s.seed, s.strength) for s in specs
     ]
-    for rank, collector in enumerate(collectors):
-        sampler = StudentSampler(agpd.student, Normalizer(agpd.config, point_demonstrations.meta.stats))
-        strategy = make_strategy(agpd.config, sampler.pair_with(agpd.teacher), collector.noise(0))
-        for episode in collector.roll_out(0, SCALE, strategy, done=()):
-            agpd.journal.append(0, rank, episode, algorithm.classify(episode, agpd.config.collect))
-    parts = [agpd.journal.records(0, rank) for rank in (0, 1)]
-    assert [len(part) for part in parts] == [EPISODES // 2] * 2
-    together = agpd.journal.records(0)
-    assert [repr(record) for record in together] == [repr(record) for part in parts for record in part]
-    assert len({record.seed for record in together}) == EPISODES
-    assert sum(record.strength == 0 for record in together) == TEACHER_ONLY
-    noise = [torch.randn(3, generator=collector.noise(0)) for collector in collectors]
+    assert len({record.seed for record in records}) == EPISODES
+    assert sum(record.strength == 0 for record in records) == TEACHER_ONLY
+    noise = [torch.randn(3, generator=process.collector.noise(0)) for process in processes]
     assert not torch.equal(*noise)
+
+
+@pytest.mark.parametrize(("before", "after"), [(2, 1), (1, 2), (3, 2), (2, 2)])
+@pytest.mark.parametrize("at_most", [0, 1, 2])
+def test_a_round_goes_on_with_another_number_of_processes(
+    start, point_demonstrations, before, after, at_most
+):
+    """No episode is lost, collected twice or left out; what is there stays as it is."""
+    agpd = start().agpd
+    for rank in range(before):
+        Process(agpd, point_demonstrations, rank, before).collect((), at_most)
+    first, frames = agpd.journal.records(0), episodes_on_disk(agpd)
+    done = {record.number for record in first}
+    assert len(done) == before * at_most
+    for rank in range(after):
+        Process(agpd, point_demonstrations, rank, after).collect(done)
+    records = agpd.journal.records(0)
+    assert [record.number for record in records] == list(range(EPISODES))
+    assert [repr(record) for record in records if record.number in done] == [repr(r) for r in first]
+    assert all(episodes_on_disk(agpd)[path].tobytes() == frame.tobytes() for path, frame in frames.items())
+    kept = [record.number for record in records if record.kept]
+    assert [episode.record.number for episode in agpd.journal.kept(0)] == kept
 
 
 # ---- gradient accumulation ----

@@ -200,7 +200,7 @@ def test_more_executed_steps_than_a_diffusion_student_returns(build, agpd_diffus
     config = agpd_diffusion_config(teacher=save_teacher(), collect=collect(n_action_steps=6))
     with pytest.raises(FlagError, match=r"n_action_steps=6 .*the student 4, the teacher 15"):
         policy = build(config, AGPDDiffusionPolicy)
-        policy.agpd.collect_round()
+        policy.agpd.grow()
 
 
 # ---- what is allowed and seldom intended ----
@@ -237,6 +237,7 @@ def test_episodes_of_another_run_are_not_adopted(build, guided_config, tmp_path)
 
 OTHER_EPISODES = [
     ({"guidance": GuidanceConfig(pull=0.3, at="mu")}, "guidance.at 'x0' instead of 'mu'"),
+    ({"guidance": GuidanceConfig(pull=0.1)}, "guidance.pull 0.3 instead of 0.1"),
     ({"collect": collect(min_reward=0.5)}, "collect.min_reward None instead of 0.5"),
     ({"collect": collect(keep_failures=True)}, "collect.keep_failures False instead of True"),
     ({"collect": collect(n_action_steps=2)}, "collect.n_action_steps None instead of 2"),

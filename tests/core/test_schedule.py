@@ -39,7 +39,8 @@ TOLERATED = 0.5 - TOLERANCE
         (1.0, 1.0, 0.2, GROWTH),  # better than the teacher alone
         (1.0, TOLERATED + 0.01, 0.5, GROWTH),
         (1.0, TOLERATED - 0.01, 0.5, 1 / GROWTH),
-        (1.0, 0.0, 0.0, GROWTH),  # a teacher that never succeeds cannot be hurt
+        (1.0, 0.0, 0.0, 1.0),  # nothing ever succeeds: nothing is known
+        (1.0, 0.1, 0.0, GROWTH),
         (3.0, 0.8, 0.8, 4.0),  # upper limit
         (1.5 * MIN_STRENGTH, 0.0, 0.8, MIN_STRENGTH),
         (9.0, 0.8, 0.8, 9.0),  # a first scale beyond the limit never grows

@@ -9,6 +9,9 @@ from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
 STEPS, EPISODES, TEACHER_ONLY, SCALE = 10, 6, 2, 0.25
 ROUND_STEPS = [3, 6, 9]
 
+STUDENT: dict[str, object] = {}
+"""Settings of the student beside those of tests/conftest.py."""
+
 
 class Run:
     """A run of a few steps through the hooks that LeRobot's training loop calls."""

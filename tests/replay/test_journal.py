@@ -144,17 +144,15 @@ def test_an_episode_without_a_task_has_the_demonstrations(journal, add, make_epi
 # ---- rounds ----
 
 
-def test_all_processes_episodes_ordered_by_rank_and_number(journal, add, make_episode, make_record):
-    episodes = {
-        (rank, number): make_episode(number, 1 + rank) for rank in (0, 2, 10) for number in (0, 1, 12)
-    }
-    for rank, number in [(10, 1), (10, 0), (2, 12), (0, 1), (2, 0), (0, 12), (10, 12), (0, 0), (2, 1)]:
-        add(journal, 0, rank, episodes[rank, number])
-    assert same(journal.records(0), [make_record(episodes[key]) for key in sorted(episodes)])
-    assert same(journal.records(0, rank=2), [make_record(episodes[2, n]) for n in (0, 1, 12)])
-    assert journal.records(0, rank=1) == [] and journal.records(1) == []
-    for episode, key in zip(journal.kept(0), sorted(episodes), strict=True):
-        assert_holds(episode, episodes[key])
+def test_all_processes_episodes_ordered_by_number(journal, add, make_episode, make_record):
+    episodes = [make_episode(number, 1 + number % 3) for number in range(12)]
+    for number, rank in [(3, 10), (1, 0), (11, 2), (0, 2), (2, 0), (9, 10), (10, 1)]:
+        add(journal, 0, rank, episodes[number])
+    present = [episodes[number] for number in (0, 1, 2, 3, 9, 10, 11)]
+    assert same(journal.records(0), [make_record(episode) for episode in present])
+    assert journal.records(1) == []
+    for stored, episode in zip(journal.kept(0), present, strict=True):
+        assert_holds(stored, episode)
 
 
 def test_only_kept_episodes_have_frames(journal, add, make_episode):
@@ -243,7 +241,7 @@ def killed_at(monkeypatch, call):
 
 def collect(journal, episodes, make_record):
     """What a round does: append what is missing, then finish."""
-    present = {record.number for record in journal.records(0, rank=0)}
+    present = {record.number for record in journal.records(0)}
     for episode in episodes:
         if episode.spec.number not in present:
             journal.append(0, 0, episode, make_record(episode))
@@ -292,6 +290,32 @@ def test_a_torn_last_record_is_left_out_and_written_again(journal, add, make_epi
     assert index.read_bytes() == text[:-cut], "a reader changes nothing: the line may be in the making"
     add(journal, 0, 0, make_episode(2))
     assert index.read_bytes() == text
+
+
+def test_a_finished_round_holds_nothing_half_written(journal, add, make_episode):
+    """Frames without a record and torn lines of processes that are no more; what is not ours stays."""
+    add(journal, 0, 0, make_episode(0), make_episode(2, success=False))
+    add(journal, 0, 1, make_episode(1))
+    folder = journal.root / "round-00000"
+    for name in ("rank-1-000002.npy", "rank-1-000003.npy.partial", "rank-1-000003.observation.image.npy"):
+        (folder / name).write_bytes(b"half")
+    (folder / "notes.txt").write_text("mine")
+    (folder / "my-rank-1-000002.npy").write_text("mine")
+    index = folder / "rank-1.jsonl"
+    index.write_bytes(index.read_bytes() + b'{"number": 2, "se')
+    records = journal.records(0)
+    journal.finish(0, {})
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "my-rank-1-000002.npy",
+        "notes.txt",
+        "rank-0-000000.npy",
+        "rank-0.jsonl",
+        "rank-1-000001.npy",
+        "rank-1.jsonl",
+        "report.json",
+    ]
+    assert index.read_bytes().endswith(b"\n") and same(journal.records(0), records)
+    assert len(journal.kept(0)) == 2
 
 
 # ---- damage ----

@@ -1,6 +1,7 @@
 """The journal as a LeRobotDataset."""
 
 import json
+import shutil
 import sys
 
 import numpy as np
@@ -61,24 +62,26 @@ def test_merge_equals_what_the_journal_holds(journal, add, make_episode, demonst
 
 def test_merging_again_replaces(journal, add, make_episode):
     add(journal, 0, 0, make_episode(0))
-    (journal.root / "merged.new").mkdir()  # an earlier attempt was killed
     assert len(merge(journal.root, "local/merged")) == 3
+    for left in ("new", "replaced"):  # by attempts that were killed
+        shutil.copytree(journal.root / "merged", journal.root / f"merged.{left}")
     add(journal, 0, 0, make_episode(1))
     assert len(merge(journal.root, "local/merged")) == 6
     assert [path.name for path in journal.root.glob("merged*")] == ["merged"]
     assert len(journal.kept(0)) == 2
 
 
-def test_a_foreign_folder_is_not_deleted(journal, add, make_episode, demonstrations):
+@pytest.mark.parametrize("name", ["merged", "merged.new", "merged.replaced"])
+def test_a_foreign_folder_is_not_deleted(journal, add, make_episode, demonstrations, name):
     add(journal, 0, 0, make_episode(0))
-    merged = journal.root / "merged"
+    merged = journal.root / name
     merged.mkdir()
     (merged / "thesis.txt").write_text("mine")
-    with pytest.raises(ValueError, match="merged exists"):
+    with pytest.raises(ValueError, match=f"{name} exists"):
         merge(journal.root)
     (merged / "meta").mkdir()
     (merged / "meta" / "info.json").write_text((demonstrations.root / "meta" / "info.json").read_text())
-    with pytest.raises(ValueError, match="merged exists"):
+    with pytest.raises(ValueError, match=f"{name} exists"):
         merge(journal.root)
     assert (merged / "thesis.txt").exists()
 

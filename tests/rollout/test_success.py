@@ -90,4 +90,14 @@ def test_an_episode_with_a_number_that_is_not_finite_is_dropped(key, value, conf
     valid.columns[key][1] = value
     record = classify(valid, config)
     assert (record.success, record.kept) == (False, False)
-    assert record.invalid == f"'{key}' at step 1"
+    assert record.invalid == f"'{key}' at step 1 is not finite"
+
+
+@pytest.mark.parametrize("n_steps", [0, 1, 3])
+@pytest.mark.parametrize("config", [CollectConfig(keep_failures=True), CollectConfig(min_reward=0.5)])
+def test_an_episode_that_its_environment_did_not_finish_is_dropped(n_steps, config):
+    stuck = replace(episode([9.0] * n_steps), problem="no answer")
+    record = classify(stuck, config)
+    assert record.invalid == "no answer" and record.length == n_steps
+    assert not (record.success or record.kept or record.solved_at_start)
+    assert record.to_json()["max_reward"] == (9.0 if n_steps else None)

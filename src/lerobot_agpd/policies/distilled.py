@@ -2,7 +2,9 @@
 
 import logging
 import math
+import weakref
 from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,9 @@ from lerobot_agpd.adversary import Discriminator
 from lerobot_agpd.agpd import AGPD
 from lerobot_agpd.build import build_parts
 from lerobot_agpd.config import StudentConfig, require
+from lerobot_agpd.continuation import how_to_continue
 from lerobot_agpd.guidance.representation import LR, StateRepresentation
+from lerobot_agpd.interrupts import InterruptMessage
 from lerobot_agpd.policies.gradient_norms import GradientNorms
 from lerobot_agpd.replay.demonstrations import delivers_single_frames
 from lerobot_agpd.replay.export import merge
@@ -72,11 +76,13 @@ class DistilledPolicy(Student):
             self.representation = StateRepresentation(vector_dim(config), action_dim, n_steps)
         self._gradient_norms = GradientNorms(self.parameter_groups())
         self._last_norms: dict[str, float] = {}
-        run = run or RunInfo.of(config)
+        is_lerobots, run = run is None, run or RunInfo.of(config)
         self._training_data = (dataset_meta, dataset_stats, run or RunInfo())
         self._agpd: AGPD | None = None
         if run is not None and dataset_meta is not None:
-            self.agpd  # noqa: B018  # wrong input ends the run here, before training starts
+            agpd = self.agpd  # wrong input ends the run here, before training starts
+            if is_lerobots:
+                self._watch_interruptions(agpd)
 
     @property
     def agpd(self) -> AGPD:
@@ -86,6 +92,15 @@ class DistilledPolicy(Student):
             with seeded_context(seed):  # loading a teacher draws numbers, which a resumed run must not notice
                 self._agpd = AGPD(self, build_parts(self, *self._training_data, seed=seed))
         return self._agpd
+
+    def _watch_interruptions(self, agpd: AGPD) -> None:
+        """Let Ctrl-C and SIGTERM say how the run goes on, until this policy is no longer used."""
+        if agpd.journal is None or agpd.run.output_dir is None:
+            return
+        text = partial(how_to_continue, agpd.run.output_dir, agpd.journal.root)
+        message = InterruptMessage(text if PartialState().is_main_process else None)
+        message.watch()
+        weakref.finalize(self, message.restore)
 
     # ---- LeRobot's training loop ----
 

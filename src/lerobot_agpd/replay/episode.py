@@ -57,6 +57,7 @@ class Episode:
         guidance_shift: mean root-mean-square shift of the guided denoising steps, in sigmas; NaN if unguided.
         student_steps: steps that the student executed before the teacher took over.
         student_alone: whether the episode ended before the teacher took over.
+        problem: why the environment did not finish it; then observations and actions are missing.
     """
 
     spec: EpisodeSpec
@@ -69,6 +70,7 @@ class Episode:
     guidance_shift: float = NAN
     student_steps: int = 0
     student_alone: bool = False
+    problem: str | None = None
 
     def __len__(self) -> int:
         """Number of steps T."""
@@ -81,8 +83,8 @@ class Episode:
 
     @property
     def max_reward(self) -> float:
-        """Largest reward of any step."""
-        return float(self.rewards.max())
+        """Largest reward of any step; NaN without a step."""
+        return float(self.rewards.max()) if len(self.rewards) else NAN
 
     @property
     def columns(self) -> dict[str, Array]:
@@ -110,8 +112,8 @@ class EpisodeRecord:
         student_steps: steps that the student executed before the teacher took over.
         student_alone: whether the episode ended before the teacher took over.
         retry: whether an earlier round's episode from this start failed.
-        invalid: where the episode holds a number that is not finite, as "'feature' at step n"; such an episode never
-            succeeds and is never kept. None: nowhere.
+        invalid: what is wrong with the episode: a number that is not finite, or an environment that got stuck; such an
+            episode never succeeds and is never kept. None: nothing.
     """
 
     number: int

@@ -55,7 +55,8 @@ def merge(root: Path, repo_id: str | None = None) -> LeRobotDataset | None:
     """
     journal = EpisodeJournal(root)
     merged, fresh, replaced = (root / f"{MERGED}{suffix}" for suffix in ("", ".new", ".replaced"))
-    _check_replaceable(merged)
+    for folder in (merged, fresh, replaced):  # the last two are what a killed merge leaves
+        _check_replaceable(folder)
     episodes = iter(journal.stored())
     first = next(episodes, None)
     if first is None:
@@ -71,6 +72,7 @@ def merge(root: Path, repo_id: str | None = None) -> LeRobotDataset | None:
         use_videos=any(feature["dtype"] == "video" for feature in features.values()),
     )
     writer.write(_frames(journal, features, *stored) for stored in (first, *episodes))
+    shutil.rmtree(replaced, ignore_errors=True)
     if merged.exists():
         merged.rename(replaced)
     fresh.rename(merged)

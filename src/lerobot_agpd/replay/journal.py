@@ -2,7 +2,7 @@
 
     <root>/
         journal.json                              the demonstrations' features, and the run the episodes belong to
-        round-00000/rank-0.jsonl                  index: one record per generated episode, in the order of their ends
+        round-00000/rank-0.jsonl                  index of process 0: one record per episode, in the order of their ends
         round-00000/rank-0-000012.npy             vectors of kept episode 12, one row per step
         round-00000/rank-0-000012.<camera>.npy    its frames of a camera, (T, H, W, C) uint8
         round-00000/report.json                   written last: its presence makes the round a finished one
@@ -10,7 +10,8 @@
 
 Files are complete once they have their name: they are written under another one, synced and renamed. An episode's
 frames are on disk before its record is, so a process may be killed at any point and loses at most the episodes that
-were running. Reading changes nothing, so another process may read while a run collects.
+were running. Episodes are numbered over all processes, so a round goes on with any number of them. Reading changes
+nothing, so another process may read while a run collects.
 """
 
 from __future__ import annotations
@@ -24,7 +25,14 @@ from typing import Any
 
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-from lerobot_agpd.files import append_line, complete_lines, read_json, write_array, write_json
+from lerobot_agpd.files import (
+    append_line,
+    complete_lines,
+    read_json,
+    trim_incomplete_line,
+    write_array,
+    write_json,
+)
 from lerobot_agpd.replay.episode import Episode, EpisodeRecord
 from lerobot_agpd.replay.stored import StoredEpisode, camera_path, split_columns
 
@@ -32,6 +40,9 @@ logger = logging.getLogger(__name__)
 
 HEADER = "journal.json"
 REPORT = "report.json"
+
+FRAMES_NAME = re.compile(r"(?P<stem>rank-\d+-\d{6,})(\..+)?\.npy(?P<partial>\.partial)?")
+"""Names of `_frames_path` and `camera_path`, and what they are called while they are written."""
 
 
 class EpisodeJournal:
@@ -130,24 +141,40 @@ class EpisodeJournal:
         append_line(_index_path(folder, rank), json.dumps(entry))
 
     def finish(self, round_number: int, report: Mapping[str, Any]) -> None:
-        """Make a round a finished one; called by one process after all have written their episodes."""
+        """Make a round a finished one; called by one process after all have written their episodes.
+
+        What a killed process has left half-written in the round's folder is removed.
+        """
         folder = self.folder(round_number)
         folder.mkdir(parents=True, exist_ok=True)
+        self._remove_leftovers(round_number)
         write_json(folder / REPORT, report, indent=2)
+
+    def _remove_leftovers(self, round_number: int) -> None:
+        """Remove incomplete lines, and frames that no record claims; names that are not ours are left alone."""
+        folder = self.folder(round_number)
+        for rank in _ranks(folder):
+            trim_incomplete_line(_index_path(folder, rank))
+        claimed = {
+            _frames_path(folder, rank, entry["number"]).stem for rank, entry in self._kept(round_number)
+        }
+        for path in folder.iterdir():
+            frames = FRAMES_NAME.fullmatch(path.name)
+            if frames and (frames["partial"] or frames["stem"] not in claimed):
+                path.unlink()
 
     # ---- reading ----
 
-    def records(self, round_number: int, rank: int | None = None) -> list[EpisodeRecord]:
-        """Records of a round's episodes, of one process or of all, ordered by rank and number.
+    def records(self, round_number: int) -> list[EpisodeRecord]:
+        """Records of a round's episodes, of all processes, ordered by number.
 
         Raises:
             ValueError: if an index is damaged.
         """
-        entries = self._entries(round_number)
-        return [_record(entry) for owner, entry in entries if rank is None or owner == rank]
+        return [_record(entry) for _, entry in self._entries(round_number)]
 
     def kept(self, round_number: int) -> list[StoredEpisode]:
-        """The kept episodes of a round, of all processes, ordered by rank and number.
+        """The kept episodes of a round, of all processes, ordered by number.
 
         Raises:
             ValueError: if an index is damaged.
@@ -160,8 +187,7 @@ class EpisodeJournal:
                 path=_frames_path(folder, rank, entry["number"]),
                 cameras=tuple(entry["cameras"]),
             )
-            for rank, entry in self._entries(round_number)
-            if entry["kept"]
+            for rank, entry in self._kept(round_number)
         ]
 
     def stored(self) -> Iterator[tuple[int, StoredEpisode]]:
@@ -170,13 +196,17 @@ class EpisodeJournal:
             for episode in self.kept(round_number):
                 yield round_number, episode
 
+    def is_finished(self, round_number: int) -> bool:
+        """Whether a round has its report."""
+        return (self.folder(round_number) / REPORT).exists()
+
     def reports(self) -> list[dict[str, Any]]:
         """Reports of the finished rounds, in order.
 
         Raises:
             ValueError: if a round before the last finished one is not finished, or a report is damaged.
         """
-        finished = [number for number in self._rounds() if (self.folder(number) / REPORT).exists()]
+        finished = [number for number in self._rounds() if self.is_finished(number)]
         missing = set(range(len(finished))) - set(finished)
         if missing:
             raise ValueError(
@@ -197,19 +227,27 @@ class EpisodeJournal:
         """Folder of a round, whether it exists or not."""
         return self.root / f"round-{round_number:05d}"
 
+    def _kept(self, round_number: int) -> list[tuple[int, dict[str, Any]]]:
+        return [(rank, entry) for rank, entry in self._entries(round_number) if entry["kept"]]
+
     def _entries(self, round_number: int) -> list[tuple[int, dict[str, Any]]]:
-        """Lines of a round's indices with their ranks, ordered by rank and number."""
+        """Lines of a round's indices with their ranks, ordered by number."""
         folder = self.folder(round_number)
-        if not folder.exists():
-            return []
-        names = (re.fullmatch(r"rank-(\d+)\.jsonl", path.name) for path in folder.iterdir())
         found: dict[tuple[int, int], dict[str, Any]] = {}
-        for rank in (int(name[1]) for name in names if name):
+        for rank in _ranks(folder):
             path = _index_path(folder, rank)
             for position, line in enumerate(complete_lines(path), start=1):
                 entry = _parsed(line, path, position)
-                found[rank, entry["number"]] = entry
-        return [(rank, found[rank, number]) for rank, number in sorted(found)]
+                found[entry["number"], rank] = entry
+        return [(rank, found[number, rank]) for number, rank in sorted(found)]
+
+
+def _ranks(folder: Path) -> list[int]:
+    """Processes that have an index in a round's folder."""
+    if not folder.exists():
+        return []
+    names = (re.fullmatch(r"rank-(\d+)\.jsonl", path.name) for path in folder.iterdir())
+    return sorted(int(name[1]) for name in names if name)
 
 
 def _parsed(line: str, path: Path, position: int) -> dict[str, Any]:

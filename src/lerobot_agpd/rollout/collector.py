@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 
 import torch
+from gymnasium.vector import AsyncVectorEnv, VectorEnv
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors
 from lerobot.utils.random_utils import seeded_context
@@ -21,7 +22,7 @@ from lerobot_agpd.rollout.diagnostics import (
     action_diagnostics,
     state_diagnostics,
 )
-from lerobot_agpd.rollout.rollout import Decision, Rollouts
+from lerobot_agpd.rollout.rollout import Decision, Rollouts, step_limit
 from lerobot_agpd.rollout.seeds import (
     DIAGNOSTICS_STREAM,
     TEACHER_NOISE_STREAM,
@@ -31,9 +32,13 @@ from lerobot_agpd.rollout.seeds import (
     stream_seed,
 )
 from lerobot_agpd.rollout.strategies import Strategy
+from lerobot_agpd.rollout.watched import end_workers
 from lerobot_agpd.stopwatch import Stopwatch
 
 logger = logging.getLogger(__name__)
+
+MAX_STEPS = 10_000
+"""Steps after which an episode is cut off where the environment does not say when it ends one."""
 
 
 class Collector:
@@ -68,6 +73,7 @@ class Collector:
         self.check = check
         self.seed, self.rank, self.n_ranks = seed, rank, n_ranks
         self._reservoir: ObservationReservoir | None = None
+        self._own_limit: int | None = None  # steps of an episode, asked of the environment once
 
     def noise(self, round_number: int) -> torch.Generator:
         """Source of this process's sampling noise in a round."""
@@ -79,45 +85,42 @@ class Collector:
         return stream_seed(self.seed, self.rank, round_number, stream)
 
     def specs(self, round_number: int, strength: float) -> list[EpisodeSpec]:
-        """The episodes of this process's part of a round; the same at every call."""
+        """The episodes of a round, of all processes; the same at every call."""
         collect = self.config.collect
-        n_retries = int(collect.retry_fraction * rank_part(collect.episodes, self.rank, self.n_ranks))
+        n_retries = int(collect.retry_fraction * collect.episodes)
         earlier: list[EpisodeRecord] = []
         if n_retries:
             earlier = [record for number in range(round_number) for record in self.journal.records(number)]
         return episode_specs(
             collect.episodes,
             self.seed,
-            self.rank,
-            self.n_ranks,
             round_number,
             strength,
             collect.teacher_only_fraction,
             student_begins=collect.strategy == "rollin",
-            retries=failed_starts(earlier)[self.rank :: self.n_ranks][:n_retries],
+            retries=failed_starts(earlier)[:n_retries],
         )
 
     def roll_out(
         self, round_number: int, strength: float, strategy: Strategy, done: Collection[int]
     ) -> Iterator[Episode]:
-        """Yield the round's episodes as they finish.
+        """Yield this process's part of the round's missing episodes as they finish.
 
         Args:
             round_number: of the round.
             strength: pull, guidance scale or mixing weight.
             strategy: made for this round; its stopwatch takes the time.
-            done: numbers of the episodes that an interrupted round has already collected.
+            done: numbers of the episodes that an interrupted round has already collected, on any number of processes;
+                the same on every process.
         """
         self._reservoir = None
         if self.config.collect.diagnostics:
             self._reservoir = ObservationReservoir(self.stream_seed(round_number, TEACHER_NOISE_STREAM))
-        specs = self.specs(round_number, strength)
-        missing = [spec for spec in specs if spec.number not in done]
+        missing = rank_part(self.specs(round_number, strength), done, self.rank, self.n_ranks)
         if not missing:
             return
         progress = tqdm(
-            total=len(specs),
-            initial=len(specs) - len(missing),
+            total=len(missing),
             desc=f"Collecting round {round_number}",
             unit="episode",
             leave=False,
@@ -134,34 +137,94 @@ class Collector:
         strategy: Strategy,
         on_decision: Callable[[Decision], None] | None,
     ) -> Iterator[Episode]:
-        n_envs = min(self.config.collect.n_envs, len(specs))
-        tasks = make_env(self.env_config, n_envs=n_envs, use_async_envs=self.config.collect.use_async_envs)
+        """Roll out the specs; where environments get stuck, the episodes beside theirs begin anew in new ones.
+
+        Raises:
+            TimeoutError: if environments get stuck without an episode of theirs.
+        """
+        while specs:
+            ended, problem = set(), None
+            for episode in self._until_stuck(specs, strategy, on_decision):
+                ended.add(episode.spec.number)
+                problem = episode.problem or problem
+                yield episode
+            specs = [spec for spec in specs if spec.number not in ended]
+            if specs and not ended:
+                raise TimeoutError(
+                    f"the environment '{self.env_config.type}' (--env.*) does not answer in "
+                    f"{self.config.collect.step_timeout:g} s (--policy.collect.step_timeout), or its worker processes end"
+                )
+            if problem:
+                logger.warning(
+                    "%s: its episode is dropped; the %d that are left go on in new environments",
+                    problem,
+                    len(specs),
+                )
+
+    def _until_stuck(
+        self,
+        specs: list[EpisodeSpec],
+        strategy: Strategy,
+        on_decision: Callable[[Decision], None] | None,
+    ) -> Iterator[Episode]:
+        """Roll out the specs, up to the first environments that get stuck: the last episodes then are theirs."""
+        collect = self.config.collect
+        n_envs = min(collect.n_envs, len(specs))
+        tasks = make_env(self.env_config, n_envs=n_envs, use_async_envs=collect.use_async_envs)
         environments = [envs for suite in tasks.values() for envs in suite.values()]
         processors = make_env_pre_post_processors(self.env_config, self.config)
+        completed = False
         try:
+            max_steps = self._max_steps(environments)
             for position, envs in enumerate(environments):
-                rollouts = Rollouts(envs, processors, strategy, on_decision, self.check)
-                yield from rollouts.run(specs[position :: len(environments)])
+                rollouts = Rollouts(
+                    envs, processors, strategy, on_decision, self.check, max_steps, collect.step_timeout
+                )
+                yield from rollouts.run(spec for spec in specs if spec.number % len(environments) == position)
+                if rollouts.problem is not None:
+                    return
+            completed = True
         finally:
+            if not completed:
+                for envs in environments:
+                    end_workers(envs)
             close_envs(tasks)
+
+    def _max_steps(self, environments: Sequence[VectorEnv]) -> int:
+        """Steps after which an episode is cut off: --policy.collect.max_episode_steps, or the environment's own limit.
+
+        One step more than its own, so that an environment that keeps its limit ends every episode itself.
+        """
+        if self.config.collect.max_episode_steps is not None:
+            return self.config.collect.max_episode_steps
+        if self._own_limit is None:
+            if any(isinstance(envs, AsyncVectorEnv) for envs in environments):
+                # A worker process that is asked for an attribute that it lacks ends; an environment in this one does not.
+                tasks = make_env(self.env_config, n_envs=1, use_async_envs=False)
+                limits = [step_limit(envs) for suite in tasks.values() for envs in suite.values()]
+                close_envs(tasks)
+            else:
+                limits = [step_limit(envs) for envs in environments]
+            known = [limit for limit in limits if limit is not None]
+            self._own_limit = max(known) + 1 if len(known) == len(limits) else MAX_STEPS
+        return self._own_limit
 
     def require_valid_episodes(self, round_number: int) -> None:
         """Warn of a round's invalid episodes, of all processes, which have been dropped.
 
         Raises:
-            FloatingPointError: if most of the round's episodes are invalid.
+            RuntimeError: if most of the round's episodes are invalid.
         """
         records = self.journal.records(round_number)
         invalid = [record for record in records if record.invalid]
         if not invalid:
             return
         facts = (
-            f"round {round_number}: {len(invalid)} of {len(records)} episodes are dropped because they hold numbers that "
-            f"are not finite (first: {invalid[0].invalid}, environment seed {invalid[0].seed}), which come from the "
-            f"environment '{self.env_config.type}' (--env.*)"
+            f"round {round_number}: {len(invalid)} of {len(records)} episodes are dropped (first: {invalid[0].invalid}, "
+            f"environment seed {invalid[0].seed}), because of the environment '{self.env_config.type}' (--env.*)"
         )
         if 2 * len(invalid) > len(records):
-            raise FloatingPointError(
+            raise RuntimeError(
                 f"{facts}. Repair it, delete {self.journal.folder(round_number)} and go on with --resume=true"
             )
         logger.warning(facts)

@@ -162,15 +162,21 @@ def round_scalars(reports: Sequence[RoundReport]) -> dict[str, float]:
     return scalars
 
 
-def log_round(report: RoundReport) -> None:
-    """Say on the console what a round brought."""
+def log_round(report: RoundReport, again: bool = False) -> None:
+    """Say on the console what a round brought.
+
+    Args:
+        report: of the round.
+        again: whether it was collected before the run was interrupted.
+    """
     tallies = (report.strategy, report.teacher_only, report.retried)
     rates = [success_rate([tally]) for tally in tallies]
     shown = ["-" if rate is None else f"{rate:.2f}" for rate in rates]
     logger.info(
-        "round %d: %d episodes, %d invalid, %d successful, %d kept; success of the strategy %s, of the teacher alone %s, of failed "
-        "starts %s; strength %.3g, next %.3g; %.0f s",
+        "round %d%s: %d episodes, %d invalid, %d successful, %d kept; success of the strategy %s, of the teacher alone %s, "
+        "of failed starts %s; strength %.3g, next %.3g; %.0f s",
         report.round,
+        " (collected before the interruption)" if again else "",
         report.total.generated,
         report.total.invalid,
         report.total.successful,
@@ -180,7 +186,16 @@ def log_round(report: RoundReport) -> None:
         report.next_strength,
         sum(report.seconds.values()),
     )
-    if report.total.kept == 0:
+    total = report.total
+    if total.solved_at_start and total.solved_at_start == total.generated - total.invalid:
+        logger.warning(
+            "round %d kept no episode: all %d were solved at the start, so there is nothing to learn from them. The "
+            "environment reports success at its first step (is_success in its info, or a reward of at least "
+            "--policy.collect.min_reward)",
+            report.round,
+            total.solved_at_start,
+        )
+    elif total.kept == 0:
         logger.warning(
             "round %d kept no episode: the student goes on with what it has. If this persists, the teacher is too "
             "weak or the success filter too strict (--policy.collect.min_reward)",

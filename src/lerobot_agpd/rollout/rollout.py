@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +20,9 @@ from lerobot_agpd.guidance.teacher import TASK, History
 from lerobot_agpd.replay.episode import Array, Episode, EpisodeSpec
 from lerobot_agpd.rollout.running_episode import RunningEpisode, as_recorded
 from lerobot_agpd.rollout.strategies import ChunkBatch, Strategy
+from lerobot_agpd.rollout.watched import StuckEnvironmentsError, WatchedEnvs
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,11 @@ class Rollouts:
         strategy: decides; its stopwatch takes the environments' time too.
         on_decision: told of every decision.
         check: raises if an episode's first observation (vectors (D,), images (H, W, C)) could not be kept.
+        max_steps: an episode that its environment has not ended after so many steps is cut off.
+        step_timeout: seconds that a reset or a step may take; None: any time.
+
+    Attributes:
+        problem: why the environments got stuck; None if they did not.
     """
 
     def __init__(
@@ -57,20 +67,39 @@ class Rollouts:
         strategy: Strategy,
         on_decision: Callable[[Decision], None] | None = None,
         check: Callable[[Mapping[str, Array]], None] | None = None,
+        max_steps: float = math.inf,
+        step_timeout: float | None = None,
     ):
-        self.envs = envs
+        self.envs, self.watched = envs, WatchedEnvs(envs, step_timeout)
         self.preprocess, self.postprocess = processors
         self.strategy = strategy
         self.on_decision = on_decision
         self.check = check
+        self.max_steps = max_steps
         self.task = _task_description(envs)
+        self.problem: str | None = None
         self._was_reset = False
+        self._has_cut = False
 
     @torch.no_grad()
     def run(self, specs: Iterable[EpisodeSpec]) -> Iterator[Episode]:
-        """Yield episodes as they finish; slots without a further episode idle until the last one is done."""
-        waiting = iter(specs)
+        """Yield episodes as they finish; slots without a further episode idle until the last one is done.
+
+        If environments get stuck, the episodes that run in them are yielded with what is wrong, and no others: the vector
+        environment cannot be used again.
+        """
         running: list[RunningEpisode | None] = [None] * self.envs.num_envs
+        with self.watched.watching():
+            try:
+                yield from self._run(running, iter(specs))
+            except StuckEnvironmentsError as stuck:
+                self.problem = stuck.problem
+                for slot in stuck.slots:
+                    entry = running[slot]
+                    if entry is not None:
+                        yield entry.give_up(self.task, stuck.problem)
+
+    def _run(self, running: list[RunningEpisode | None], waiting: Iterator[EpisodeSpec]) -> Iterator[Episode]:
         free = list(range(len(running)))
         while True:
             if free:
@@ -104,7 +133,8 @@ class Rollouts:
             mask[:] = True  # sub-environments without an episode need an observation too
             self._was_reset = True
         with self.strategy.stopwatch.measure("environment"):
-            raw, _ = self.envs.reset(seed=seeds, options={"reset_mask": mask, NEW_ROLLOUT_OPTION: True})
+            options = {"reset_mask": mask, NEW_ROLLOUT_OPTION: True}
+            raw, _ = self.watched.reset(seed=seeds, options=options)
             observations = self._observe(raw)
         for slot in free:
             entry = running[slot]
@@ -116,7 +146,15 @@ class Rollouts:
 
     def _student_steps(self, spec: EpisodeSpec) -> int:
         """Steps after which the student hands over."""
-        return round(spec.student_fraction * step_limit(self.envs)) if spec.student_fraction else 0
+        if not spec.student_fraction:
+            return 0
+        limit = step_limit(self.envs)
+        if limit is None:
+            raise ValueError(
+                "--policy.collect.strategy=rollin gives the student a fraction of the longest episode, and the environment "
+                "does not say after how many steps it ends one (no _max_episode_steps); use another strategy"
+            )
+        return round(spec.student_fraction * limit)
 
     def _observe(self, raw: Any) -> dict[str, Tensor]:
         """LeRobot's observation features, tensors (n_envs, ...) only."""
@@ -158,7 +196,7 @@ class Rollouts:
         executed = self._for_environment([action for action, _ in planned])
         recorded = self._for_environment([action for _, action in planned])
         with self.strategy.stopwatch.measure("environment"):
-            raw, rewards, terminated, truncated, info = self.envs.step(executed)
+            raw, rewards, terminated, truncated, info = self.watched.step(executed)
             observations = self._observe(raw)
         done = terminated | truncated
         finished = []
@@ -166,7 +204,16 @@ class Rollouts:
             if entry is None:
                 continue
             entry.record(recorded[slot], float(rewards[slot]), _success(info, slot, bool(done[slot])))
-            if done[slot]:
+            is_cut = not done[slot] and entry.n_steps >= self.max_steps
+            if is_cut and not self._has_cut:
+                self._has_cut = True
+                logger.warning(
+                    "an episode (environment seed %d) is cut off after %d steps: its environment has not ended it; further "
+                    "ones are cut off alike (--policy.collect.max_episode_steps)",
+                    entry.spec.seed,
+                    entry.n_steps,
+                )
+            if done[slot] or is_cut:
                 finished.append((slot, entry.finish(self.task)))
         return observations, finished
 
@@ -176,19 +223,12 @@ class Rollouts:
         return processed.cpu().numpy()
 
 
-def step_limit(envs: gym.vector.VectorEnv) -> int:
-    """Steps after which the environment cuts an episode off, where LeRobot's own evaluation looks for them.
-
-    Raises:
-        ValueError: if it does not say.
-    """
+def step_limit(envs: gym.vector.VectorEnv) -> int | None:
+    """Steps after which an environment ends its episodes, where LeRobot's own evaluation looks for them; None if unknown."""
     try:
         return int(_attribute(envs, "_max_episode_steps"))
-    except (AttributeError, TypeError) as error:
-        raise ValueError(
-            "--policy.collect.strategy=rollin gives the student a fraction of the longest episode, and the environment "
-            "does not say after how many steps it ends one (no _max_episode_steps); use another strategy"
-        ) from error
+    except (AttributeError, TypeError):
+        return None
 
 
 def _attribute(envs: gym.vector.VectorEnv, name: str) -> Any:

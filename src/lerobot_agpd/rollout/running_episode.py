@@ -40,6 +40,11 @@ class RunningEpisode:
         self._shifts: list[float] = []
 
     @property
+    def n_steps(self) -> int:
+        """Number of steps so far."""
+        return len(self._actions)
+
+    @property
     def student_acts(self) -> bool:
         """Whether the student makes the next decision."""
         return len(self._actions) < self._student_steps
@@ -85,6 +90,18 @@ class RunningEpisode:
             guidance_shift=_mean(self._shifts),
             student_steps=takeover,
             student_alone=alone,
+        )
+
+    def give_up(self, task: str, problem: str) -> Episode:
+        """The episode without its observations and actions, and why it was not finished."""
+        return Episode(
+            spec=self.spec,
+            task=task,
+            observations={},
+            actions=np.zeros((self.n_steps, 0), dtype=np.float32),
+            rewards=np.array(self._rewards, dtype=np.float32),
+            successes=None,
+            problem=problem,
         )
 
 

@@ -1,8 +1,8 @@
-"""Seeds of collection: reproducible per process and round, disjoint from evaluation's."""
+"""Seeds of collection: an episode's follow from run, round and its number; disjoint from evaluation's."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
@@ -31,32 +31,23 @@ def stream_seed(seed: int, rank: int, round_number: int, stream: int) -> int:
     return int(state[0])
 
 
-def rank_part(n_episodes: int, rank: int, n_ranks: int) -> int:
-    """How many of a round's episodes a process collects."""
-    return n_episodes // n_ranks + (rank < n_episodes % n_ranks)
-
-
 def episode_specs(
     n_episodes: int,
     seed: int,
-    rank: int,
-    n_ranks: int,
     round_number: int,
     strength: float,
     teacher_only_fraction: float,
     student_begins: bool = False,
     retries: Sequence[int] = (),
 ) -> list[EpisodeSpec]:
-    """The episodes of a round that one process collects.
+    """The episodes of a round, whatever the number of processes that share it.
 
-    Environment seeds come from SeedSequence([seed, rank, round]); teacher-only episodes are spread evenly over the
-    round, whatever the number of processes. What else differs between episodes comes from their own seeds.
+    Environment seeds come from SeedSequence([seed, 0, round]); teacher-only episodes are spread evenly over the
+    round. What else differs between episodes comes from their own seeds.
 
     Args:
         n_episodes: of the round, over all processes.
         seed: of the run.
-        rank: of this process.
-        n_ranks: number of processes.
         round_number: of the round.
         strength: pull, guidance scale or mixing weight.
         teacher_only_fraction: fraction of the episodes whose strength is 0.
@@ -64,12 +55,10 @@ def episode_specs(
         retries: environment seeds from which episodes start again. They take the places of the first ones that are
             not the teacher's alone; every round varies them anew.
     """
-    first = sum(rank_part(n_episodes, lower, n_ranks) for lower in range(rank))
-    n_episodes = rank_part(n_episodes, rank, n_ranks)
-    rng = np.random.default_rng(np.random.SeedSequence([seed, rank, round_number]))
+    # The 0 was the rank while processes drew for themselves; runs of one process keep their seeds.
+    rng = np.random.default_rng(np.random.SeedSequence([seed, 0, round_number]))
     seeds = rng.integers(*COLLECTION_SEEDS, size=n_episodes)
-    positions = first + np.arange(n_episodes + 1)
-    teacher_only = np.diff(np.floor(positions * teacher_only_fraction + 1e-9)) > 0
+    teacher_only = np.diff(np.floor(np.arange(n_episodes + 1) * teacher_only_fraction + 1e-9)) > 0
     waiting = iter(retries)
     specs = []
     for number, (fresh, alone) in enumerate(zip(seeds, teacher_only, strict=True)):
@@ -82,6 +71,23 @@ def episode_specs(
             EpisodeSpec(number, env_seed, 0.0 if alone else strength, float(fraction), again is not None)
         )
     return specs
+
+
+def rank_part(
+    specs: Sequence[EpisodeSpec], done: Collection[int], rank: int, n_ranks: int
+) -> list[EpisodeSpec]:
+    """The missing episodes of a round that one process collects: equal parts, to within one episode.
+
+    Args:
+        specs: all episodes of the round.
+        done: numbers of those that are in the journal, whichever process collected them.
+        rank: of the process.
+        n_ranks: number of processes, which may differ from when the round was begun.
+    """
+    missing = [spec for spec in specs if spec.number not in done]
+    size, rest = divmod(len(missing), n_ranks)
+    first = rank * size + min(rank, rest)
+    return missing[first : first + size + (rank < rest)]
 
 
 def failed_starts(records: Iterable[EpisodeRecord]) -> list[int]:

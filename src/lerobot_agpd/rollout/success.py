@@ -16,12 +16,14 @@ def classify(episode: Episode, config: CollectConfig) -> EpisodeRecord:
     An episode succeeds if its largest reward reaches `min_reward`, or, without that, if the environment says
     `is_success` at its last step. One that succeeds at its first step, or that the student finished alone, is dropped.
     With `keep_failures` failures are kept too, as in DAgger (arXiv:1011.0686), which has no filter. An episode that
-    holds a number that is not finite is neither a success nor kept.
+    holds a number that is not finite, or that the environment did not finish, is neither a success nor kept.
 
     Raises:
         ValueError: if success is required of an environment that does not report it.
     """
-    if config.min_reward is not None:
+    if episode.problem is not None:
+        success = at_start = False
+    elif config.min_reward is not None:
         success = episode.max_reward >= config.min_reward
         at_start = bool(episode.rewards[0] >= config.min_reward)
     elif episode.successes is None:
@@ -32,8 +34,9 @@ def classify(episode: Episode, config: CollectConfig) -> EpisodeRecord:
     else:
         success = bool(episode.successes[-1])
         at_start = bool(episode.successes[0])
-    solved_at_start = at_start or len(episode) < MIN_LENGTH
-    invalid = first_not_finite(episode.columns)
+    solved_at_start = episode.problem is None and (at_start or len(episode) < MIN_LENGTH)
+    not_finite = None if episode.problem else first_not_finite(episode.columns)
+    invalid = episode.problem or (not_finite and f"{not_finite} is not finite")
     success = success and invalid is None
     worth_keeping = (success or config.keep_failures) and invalid is None
     return EpisodeRecord(

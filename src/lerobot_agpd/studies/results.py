@@ -58,7 +58,8 @@ class RunResult(Result):
         run: the cell of the matrix.
         steps: gradient steps; None for a policy that is only evaluated.
         seconds: wall-clock by activity, and in total.
-        rounds_adopted: rounds that an interrupted run's student met earlier than an uninterrupted one's.
+        rounds_adopted: rounds that an interrupted run's student met earlier than an uninterrupted one's; runs of this
+            version have none.
         made_with: kind (code, packages, teacher, demonstrations) to what it was made with, normally one of each.
         weights: digest of the weights of a policy that was only evaluated.
         ways: in a task with several, which way the kept episodes of every round took.

@@ -147,7 +147,7 @@ def _result(run: Run, matrix: Matrix, content: Mapping[str, Any]) -> RunResult:
         rounds=[RoundReport.from_json(entry) for entry in content["rounds"]],
         ways=read_ways(content.get("ways", [])),
         seconds=content["seconds"],
-        rounds_adopted=sum(start["rounds_adopted"] for start in content["starts"]),
+        rounds_adopted=sum(start.get("rounds_adopted", 0) for start in content["starts"]),
         made_with=_made_with(run, matrix, content),
         weights=content.get("weights"),
     )

@@ -30,8 +30,7 @@ from lerobot.utils.constants import (
 
 from lerobot_agpd.config import require
 from lerobot_agpd.files import read_json, write_text
-from lerobot_agpd.progress import REPLAY_FOLDER, STATE_FILE
-from lerobot_agpd.rollout.report import read_reports
+from lerobot_agpd.progress import REPLAY_FOLDER
 from lerobot_agpd.studies.provenance import inputs, provenance
 from lerobot_agpd.studies.runs import Run
 
@@ -133,7 +132,6 @@ def noted_start(run: Run, command: Sequence[str], threads: int) -> Iterator[None
         "command": list(command),
         "threads": threads,
         "from_step": last_step(run),
-        "rounds_adopted": _rounds_adopted(run),
         "inputs": inputs(run.flags),
         **provenance(),
     }
@@ -147,14 +145,6 @@ def noted_start(run: Run, command: Sequence[str], threads: int) -> Iterator[None
 
 def _write_starts(run: Run, starts: Sequence[Start]) -> None:
     write_text(run.folder / STARTS, "".join(json.dumps(start) + "\n" for start in starts))
-
-
-def _rounds_adopted(run: Run) -> int:
-    """Rounds that were finished after the last checkpoint: the resumed student meets them earlier."""
-    finished = len(read_reports(replay_folder(run)))
-    checkpoint = last_checkpoint(run)
-    state = checkpoint / PRETRAINED_MODEL_DIR / STATE_FILE if checkpoint else None
-    return finished - (read_json(state)["rounds"] if state and state.is_file() else 0)
 
 
 def read_starts(run: Run) -> list[Start]:
