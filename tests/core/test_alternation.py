@@ -137,13 +137,13 @@ def test_an_environment_that_is_solved_from_the_start_is_not_the_teachers_fault(
     assert run.agpd.reports[0].total.solved_at_start == EPISODES
     (warning,) = [r.getMessage() for r in caplog.records if "kept no episode" in r.getMessage()]
     assert f"all {EPISODES} were solved at the start" in warning and "weak" not in warning
-    assert run.agpd.scale == SCALE
+    assert run.agpd.strength == SCALE
 
 
 def test_an_environment_that_never_succeeds_leaves_the_guidance_as_it_is(start, monkeypatch, caplog):
     monkeypatch.setattr("point_environment.REACHED", -1.0)
     run = start().train(until=6)
-    assert [report.total.successful for report in run.agpd.reports] == [0, 0] and run.agpd.scale == SCALE
+    assert [report.total.successful for report in run.agpd.reports] == [0, 0] and run.agpd.strength == SCALE
     assert "the teacher is too weak or the success filter too strict" in caplog.text
 
 

@@ -237,7 +237,7 @@ def test_episodes_of_another_run_are_not_adopted(build, guided_config, tmp_path)
 
 OTHER_EPISODES = [
     ({"guidance": GuidanceConfig(pull=0.3, at="mu")}, "guidance.at 'x0' instead of 'mu'"),
-    ({"guidance": GuidanceConfig(pull=0.1)}, "guidance.pull 0.3 instead of 0.1"),
+    ({"guidance": GuidanceConfig(pull=0.1)}, "guidance.pull None instead of 0.1"),
     ({"collect": collect(min_reward=0.5)}, "collect.min_reward None instead of 0.5"),
     ({"collect": collect(keep_failures=True)}, "collect.keep_failures False instead of True"),
     ({"collect": collect(n_action_steps=2)}, "collect.n_action_steps None instead of 2"),
