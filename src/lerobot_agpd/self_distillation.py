@@ -45,6 +45,7 @@ class SelfTeacher:
 
     def unchanged(self, stats: Statistics) -> Teacher:
         """The student as it is now as a teacher, without a snapshot: how it samples is known before training."""
+        assert isinstance(self.student, PreTrainedPolicy)
         return self._as_teacher(self.student, stats)
 
     def _as_teacher(self, policy: PreTrainedPolicy, stats: Statistics) -> Teacher:

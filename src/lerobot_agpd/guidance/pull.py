@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -75,7 +76,7 @@ Sampler = tuple[ReverseStep, ...]
 
 def diffusion_sampler(scheduler: DDPMScheduler | DDIMScheduler, n_steps: int) -> Sampler:
     """The steps of a diffusers scheduler, which is left as it is (DDPM, arXiv:2006.11239; DDIM, arXiv:2010.02502)."""
-    scheduler = type(scheduler).from_config(scheduler.config)
+    scheduler = deepcopy(scheduler)
     scheduler.set_timesteps(n_steps)
     return tuple(_diffusion_step(scheduler, int(timestep)) for timestep in scheduler.timesteps)
 

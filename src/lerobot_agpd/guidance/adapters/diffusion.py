@@ -50,7 +50,7 @@ class DiffusionTeacher(Teacher):
         return self.policy.config.resize_shape is not None
 
     @property
-    def sampler(self) -> Sampler:
+    def sampler(self) -> Sampler | None:
         """The steps of its noise scheduler."""
         model = self.policy.diffusion
         return diffusion_sampler(model.noise_scheduler, model.num_inference_steps)
