@@ -121,7 +121,7 @@ class EitherSideTask(FetchWaysTask):
 def _around(radius: float, height: float) -> tuple[Point, Point, Point]:
     """Three points at one distance from where the hand starts, so that no way begins earlier than another.
 
-    One lies ahead, two behind on the left and right. Their coordinate-wise median lies between the last two.
+    One lies ahead, two behind it on the left and right. Their coordinate-wise median lies between the last two.
     """
     x, y = 1.342, 0.749
     back = 0.58 * radius
@@ -156,7 +156,7 @@ TASKS: dict[str, FetchWaysTask] = {
         slope=2.1,
     ),
     "PickAndPlaceAnyPlace-v0": AnyPlaceTask(
-        description="Pick up the block and put it down at any of the places.",
+        description="Pick up the block and bring it to any of the places.",
         model="pick_and_place",
         hand_height=0.2,
         blocks=((1.342, 0.749, 0.425),),
@@ -165,6 +165,7 @@ TASKS: dict[str, FetchWaysTask] = {
         scene=ARM_AND_OBJECT[1],
         environment_state_dim=24,
         goal_dim=9,
+        # No time for a second try: with 45 steps a student that comes down between the places drifts to one of them.
         episode_length=32,
         stride=0.05,
         slope=1.3,

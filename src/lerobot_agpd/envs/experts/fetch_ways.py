@@ -52,7 +52,7 @@ def reach_place(task: AnyPlaceTask, place: int, observation: Observation) -> np.
 
 
 def place_block(task: AnyPlaceTask, place: int, observation: Observation) -> np.ndarray:
-    """Grasp the block, lift it and put it down at a place; action (4,)."""
+    """Grasp the block, lift it and bring it down to a place; action (4,)."""
     agent_pos, state = state_vectors(observation, task.agent_pos_dim, task.environment_state_dim)
     carry = _down_the_line(task.vectors(state)[place], task)
     scene = FetchScene(agent_pos[:3], float(agent_pos[3] + agent_pos[4]), state[:3], state[:3] + carry)
