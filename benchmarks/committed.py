@@ -27,13 +27,8 @@ RENAMED_VALUES = {
 
 
 def flags(old: Mapping[str, Any]) -> Json:
-    """Dotted flags under today's names; groups that are constants now keep theirs, and no longer exist.
-
-    Runs that say nothing of guidance had its former default, a scale of 0.5.
-    """
+    """Dotted flags under today's names; groups that are constants now keep theirs, and no longer exist."""
     renamed = {RENAMED_FLAGS.get(name, name): value for name, value in old.items()}
-    if "policy.path" not in renamed and "policy.guidance.pull" not in renamed:
-        renamed.setdefault("policy.guidance.scale", 0.5)
     return {
         name: RENAMED_VALUES.get((name, value), value) if isinstance(value, str) else value
         for name, value in renamed.items()
@@ -78,9 +73,12 @@ def round_report(old: Mapping[str, Any]) -> Json:
 
 
 def run(content: Json) -> Json:
-    """A `run.json`."""
+    """A `run.json`; those before ways were counted had a scale of 0.5 where they say nothing of guidance."""
     rounds = [round_report(entry) for entry in content["rounds"]]
-    return {**content, "flags": flags(content["flags"]), "rounds": rounds}
+    renamed = flags(content["flags"])
+    if "ways" not in content and "policy.path" not in renamed:
+        renamed.setdefault("policy.guidance.scale", 0.5)
+    return {**content, "flags": renamed, "rounds": rounds}
 
 
 def read_report(path: Path) -> list[Result]:

@@ -123,7 +123,7 @@ def test_a_probe_is_reproducible_and_leaves_the_teacher_as_it_was(recorded):
 
 def test_guidance_moves_a_teacher_with_cameras(tmp_path):
     dataset = record(tmp_path / "images", WITH_CAMERA)
-    options = {**DIFFUSION, "crop_shape": None, "vision_backbone": "resnet18", "num_inference_steps": 4}
+    options = {**DIFFUSION, "crop_shape": None, "vision_backbone": "resnet18", "num_inference_steps": 10}
     teacher = make_teacher("diffusion", WITH_CAMERA, pretrained_backbone_weights=None, **options)
     probe = make_probe(teacher, dataset, n_states=2, n_samples=24)
     assert probe.samples.shape == (4, 24, 4, 2) and probe.states.has_cameras
