@@ -215,7 +215,6 @@ def _identity(config: StudentConfig, env_config: EnvConfig, seed: int) -> dict[s
         "collect.keep_failures": collect.keep_failures,
     }
     if collect.guides:
-        identity["guidance.strength"] = config.guidance.unit
         identity |= {f"guidance.{name}": value for name, value in asdict(config.guidance).items()}
     if collect.guides or collect.strategy == "nearest":
         identity["representation.type"] = config.representation.type

@@ -115,7 +115,8 @@ def test_self_distillation(denoiser: str, demos: Path, tmp_path: Path) -> None:
     rounds = reports(output)
     assert [report["strength"] > 0 for report in rounds] == [False, True, True]
     assert [report["strategy"]["generated"] for report in rounds] == [0, 2, 2]
-    assert rounds[0]["next_strength"] == 0.6, "an unguided round does not move the pull"
+    # As much of the default pull as five DDIM steps follow; an unguided round does not move it.
+    assert rounds[0]["next_strength"] == pytest.approx(0.498, abs=1e-3)
     assert rounds[1]["mean_discrepancy"] > 0
 
     checkpoint = output / "checkpoints" / "000006" / "pretrained_model"
@@ -153,4 +154,4 @@ def test_diffusion_student_of_a_teacher(demos: Path, tmp_path: Path, capfd) -> N
     )
     assert "discriminator_accuracy" in capfd.readouterr().err
     report = reports(student)[0]
-    assert report["strength"] == 0.5 and report["strategy"]["generated"] == 2
+    assert report["strength"] == pytest.approx(0.498, abs=1e-3) and report["strategy"]["generated"] == 2

@@ -1,6 +1,7 @@
 """Push-T: asynchronous evaluation, and distillation from pixels."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from commands import (
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from pusht import N_STEPS, record
 
-from lerobot_agpd.config import CollectConfig
+from lerobot_agpd.config import CollectConfig, GuidanceConfig
 from lerobot_agpd.replay.episode import Episode, EpisodeSpec
 from lerobot_agpd.replay.journal import EpisodeJournal
 from lerobot_agpd.rollout.report import RoundReport
@@ -103,7 +104,8 @@ def test_distillation_from_pixels(tmp_path: Path) -> None:
     rounds = tmp_path / "agpd"
     environment = {"type": "pusht", "task": "PushT-v0"}
     origin = {"environment": environment, "teacher": str(last_checkpoint(teacher)), "seed": 1000}
-    settings = {"guidance.at": "x0", "collect.min_reward": 0.9, "collect.keep_failures": False}
+    settings = {f"guidance.{name}": value for name, value in asdict(GuidanceConfig()).items()}
+    settings |= {"representation.type": "action", "collect.min_reward": 0.9, "collect.keep_failures": False}
     write_round(rounds, demos, {"strategy": "guided", **settings, **origin})
     printed = run(
         "lerobot-train",

@@ -139,8 +139,11 @@ def changed_defaults(matrix: str, run, config):
         return
     then = committed_flags(flat({"policy": json.loads(made.read_text())["config"]["policy"]}))
     now = flat({"policy": draccus.encode(config.policy, PreTrainedConfig)})
+    guides = run.flags.get("policy.collect.every") != 0 and config.policy.collect.guides
     of_its_own = ("path", "root", "input_features", "output_features", "env", "device", "pretrained_path")
     for name in then.keys() & now.keys():
+        if name.startswith("policy.guidance.") and not guides:
+            continue  # had another default, which decides nothing there
         if not set(name.split(".")) & set(of_its_own) and then[name] != now[name]:
             yield name, (then[name], now[name])
 
