@@ -23,7 +23,7 @@ def test_killed_runs_lose_and_repeat_nothing(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, env=environment(), timeout=1800)
     assert done.returncode == 0, done.stderr[-5000:]
     result = json.loads(counts.read_text())
-    assert result["problems"] == [] and result["done"] >= 2, result
+    assert result["problems"] == [] and result["done"] >= 1, result
 
 
 def test_a_run_that_is_told_to_end_says_how_it_goes_on(
