@@ -1,16 +1,11 @@
-"""Gather what training, `lerobot-eval` and spread.py left behind of one teacher: an entry of teachers.json beside a script.
+"""Gather what training, `lerobot-agpd-report` and spread.py left behind of one teacher: an entry of teachers.json beside a script.
 
 usage: python benchmarks/adroit/collect.py RESULT.json NAME OUTPUT_DIR
 """
 
 import json
 import sys
-from dataclasses import asdict
 from pathlib import Path
-
-from safetensors import safe_open
-
-from lerobot_agpd.studies.statistics import mean, success_rate
 
 POLICY_KEYS = ("type", "denoiser", "prediction_type", "n_obs_steps", "horizon", "n_action_steps", "mlp")
 POLICY_KEYS += ("noise_samples_per_frame", "num_inference_steps", "optimizer_lr", "scheduler_name")
@@ -21,20 +16,17 @@ def main(result: str, name: str, output: str) -> None:
     checkpoint = (folder / "checkpoints/last").resolve()
     policy = json.loads((checkpoint / "pretrained_model/config.json").read_text())
     train = json.loads((checkpoint / "pretrained_model/train_config.json").read_text())
-    with safe_open(checkpoint / "pretrained_model/model.safetensors", "np") as weights:
-        sizes = {key: weights.get_tensor(key).size for key in weights.keys()}  # noqa: SIM118  # not a dict
-    [task] = json.loads((folder / "eval/eval_info.json").read_text())["per_task"]
-    metrics = task["metrics"]
+    [method] = json.loads((folder / "report/report.json").read_text())["methods"]
     entry = {
         "steps": int(checkpoint.name),
         "planned_steps": train["steps"],
         "batch_size": train["batch_size"],
         "policy": {key: policy[key] for key in POLICY_KEYS},
-        "parameters": sum(sizes.values()),
-        "success": asdict(success_rate(metrics["successes"])),
-        "max_reward": asdict(mean(metrics["max_rewards"])),
-        "sum_reward": asdict(mean(metrics["sum_rewards"])),
-        "episodes": {key: metrics[key] for key in ("successes", "max_rewards", "sum_rewards")},
+        "parameters": method["latency"]["n_parameters"],
+        "milliseconds_per_chunk": method["latency"]["median_ms"],
+        "success": method["success"],
+        "mean_max_reward": method["mean_max_reward"],
+        "episodes": method["final"],
         "spread": json.loads((folder / "spread.json").read_text()),
     }
     path = Path(result)

@@ -13,6 +13,7 @@ else
     "$here/../pusht_teacher/teacher.sh" "$root" "$output" --policy.prediction_type="$prediction" \
         --policy.use_amp=false --steps=16000
 fi
-lerobot-eval --policy.path="$last" --policy.device=cpu --env.type=pusht --env.obs_type=environment_state_agent_pos \
-    --eval.n_episodes=100 --eval.batch_size=20 --eval.use_async_envs=false --seed=100000 --output_dir="$output/eval"
+lerobot-agpd-report --env.type=pusht --env.obs_type=environment_state_agent_pos \
+    --policies="{teacher: $last}" --episodes=100 --batch_size=20 --output="$output/report"
 python "$here/../adroit/spread.py" "$last" "$root" "$output/spread.json"
+python "$here/../adroit/collect.py" "$here/teachers.json" "$prediction" "$output"
