@@ -4,7 +4,7 @@ No teacher, no rounds: a regression network of the state to a chunk of 16 action
 expert and executes 8 of them per prediction. One row per task, loss, fractions of the ways and number of demonstrations.
 
 usage: python benchmarks/ways/average.py point_maze_ways      (average.json; 10 to 20 s on one free core per row)
-       python benchmarks/ways/average.py fetch_ways           (average_fetch.json)
+       python benchmarks/ways/average.py fetch_ways           (average_fetch.json; 5 to 20 s per row)
 """
 
 import json
