@@ -12,7 +12,7 @@ help:  ## this list
 .uv/bin/uv:
 	@python3 -m venv .uv && .uv/bin/python -m pip install --quiet uv
 
-# Compiled once, LeRobot and torch are imported in a third of the time by every command and test.
+# Compiled here once: where PYTHONDONTWRITEBYTECODE is set, every process would compile LeRobot and torch anew.
 setup: $(filter .uv/bin/uv,$(UV))  ## install the package with all extras into .venv (needs Python 3.12)
 	@$(UV) sync --frozen --all-extras --compile-bytecode
 

@@ -96,6 +96,7 @@ def draw(content: dict[str, dict[str, list]]) -> None:
             last = number == n_rounds
             for path in episodes:
                 points = np.array(path)
+                # The last recorded state is one step before success, outside of the goal radius of 0.45 m.
                 reached = np.linalg.norm(spec.exits - points[-1] / 100, axis=1).min() <= 0.9
                 way = spec.way_of(points / 100, points[:, :0])
                 color = COLORS[way] if reached else "tab:red"

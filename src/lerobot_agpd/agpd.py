@@ -30,6 +30,7 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import torch
@@ -87,6 +88,8 @@ class GuidedStrategy(Strategy):
     def __init__(self, pair: TeacherStudent, generator: torch.Generator, config: GuidanceConfig):
         super().__init__(pair, generator)
         self.config = config
+        # The teacher stays as it is for a round: k is solved once per strength, not at every decision.
+        self._scale_of = cache(lambda strength: guidance_scale(pair.teacher, strength, config))
 
     def act(self, history: History, strength: Tensor, student_acts: Tensor | None = None) -> ChunkBatch:
         """Guided chunks; `strength` is the pull (or scale), rows at 0 are the teacher's own bit for bit."""
@@ -95,7 +98,7 @@ class GuidedStrategy(Strategy):
         guide = None
         if bool((strength > 0).any()):  # else the teacher need not be one that can be guided
             discrepancy = self.pair.guiding_discrepancy(history, chunk_hat, action_j)  # J(., A_hat)
-            scale = guidance_scales(self.pair.teacher, strength, self.config)  # k
+            scale = guidance_scales(strength, self._scale_of)  # k
             guide = Guide(discrepancy, scale.to(chunk_hat.device), at=self.config.at)
         actions = self.pair.teacher_actions(history, self.generator, guide)  # Eq. 20: (B, n, A), raw
         shift = unknown(actions).to(chunk_hat.device)
@@ -132,8 +135,7 @@ def next_strength(
 
     A round is good if guided episodes succeed as often as the teacher's own, up to TOLERANCE; then the strength grows
     by GROWTH, else it shrinks by the same factor. While the student is weak its pull costs success and the strength
-    stays small; as the student improves the strength rises. Where nothing succeeds nothing is
-    known, and it stays.
+    stays small; as the student improves the strength rises. Where nothing succeeds nothing is known, and it stays.
 
     Args:
         strength: of the finished round.

@@ -240,13 +240,10 @@ def _adopt_rounds(
     used, later = reports[: progress.rounds], reports[progress.rounds :]
     for report in used:
         replay.extend(journal.kept(report.round))
-    if reports:
-        logger.info(
-            "T holds %d finished rounds of %s; %d more are used again when training reaches them",
-            len(used),
-            journal.root,
-            len(later),
-        )
+    if used:
+        logger.info("T holds %d finished rounds of %s", len(used), journal.root)
+    if later:
+        logger.info("%d finished rounds of %s enter T when training reaches them", len(later), journal.root)
     return used
 
 

@@ -106,7 +106,8 @@ class GuidanceConfig:
     """How strongly, and where, the teacher's denoising is pulled toward the student (Eq. 20)."""
 
     # Pull of the first round: how far a chunk goes toward the student, from 0 (guidance off) to 1. The guidance scale is
-    # computed from it for the teacher's own sampler (guidance/pull.py). Default: 0.6, or as much of it as the teacher's denoising steps can follow.
+    # computed from it for the teacher's own sampler (guidance/pull.py). Default: 0.6, or as much of it as the teacher's
+    # denoising steps can follow.
     pull: float | None = None
     # Instead of a pull: guidance scale k of the first round (Eq. 20), which pulls differently with every sampler; positive
     # is toward the student.

@@ -67,7 +67,7 @@ def test_a_run_without_a_checkpoint_is_repeated_with_its_episodes(start, tmp_pat
     collected = episodes_on_disk(first.agpd)
     caplog.set_level(logging.INFO)
     again = start(output_dir=tmp_path / "again", root=tmp_path / "run" / "agpd")
-    assert "2 more are used again when training reaches them" in caplog.text
+    assert "2 finished rounds of" in caplog.text and "enter T when training reaches them" in caplog.text
     again.train(until=7)
     assert "round 1 (collected before the interruption)" in caplog.text
     assert episodes_on_disk(again.agpd).keys() == collected.keys()

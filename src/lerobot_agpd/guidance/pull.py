@@ -33,8 +33,8 @@ from lerobot_agpd.guidance.guide import noise_levels, posterior_variance
 SPREAD = 0.15
 """Standard deviation of the reference teacher's chunks, in the teacher's normalized space.
 
-What the trained teachers of tasks with several ways have. With a larger one the strengths that make them choose would
-lie beyond 1 ("How far guidance pulls" in docs/method.md).
+About what a trained teacher of three ways has. With a larger one the strengths that make it choose would lie beyond 1
+("How far guidance pulls" in docs/method.md).
 """
 
 DISTANCE = 0.3

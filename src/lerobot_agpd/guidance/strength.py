@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -12,7 +13,6 @@ from lerobot_agpd.guidance.pull import acts, largest_pull, scale_of_pull
 from lerobot_agpd.guidance.teacher import Teacher
 
 STEPS_FLAG = "--policy.teacher.num_inference_steps"
-
 
 WEAKEST_PULL = 0.1
 """A teacher that the default cannot pull at least so far is refused."""
@@ -68,19 +68,17 @@ def guidance_scale(teacher: Teacher, strength: float, config: GuidanceConfig) ->
     """Return k of Eq. 20 for one strength that the teacher can follow (`require_strength`)."""
     if strength == 0 or config.unit == "scale":
         return strength
-    assert teacher.sampler is not None
+    sampler = teacher.sampler
+    assert sampler is not None
     # Strengths of rows are float32, which may be above what they stand for.
-    reachable = min(round(strength, 6), largest_strength(teacher, config))
-    return scale_of_pull(teacher.sampler, reachable, config.at)
+    reachable = min(round(strength, 6), largest_pull(sampler, config.at))
+    return scale_of_pull(sampler, reachable, config.at)
 
 
-def guidance_scales(teacher: Teacher, strength: Tensor, config: GuidanceConfig) -> Tensor:
-    """Return k of every row, (B,), for strengths (B,)."""
-    if config.unit == "scale":
-        return strength
+def guidance_scales(strength: Tensor, scale_of: Callable[[float], float]) -> Tensor:
+    """Return k of every row, (B,), for strengths (B,), given k of one strength."""
     values, row = strength.unique(return_inverse=True)  # a round has two: 0 and its own
-    scales = [guidance_scale(teacher, value, config) for value in values.tolist()]
-    return torch.tensor(scales).to(strength)[row]
+    return torch.tensor([scale_of(value) for value in values.tolist()]).to(strength)[row]
 
 
 def largest_strength(teacher: Teacher, config: GuidanceConfig) -> float:

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from lerobot_agpd.agpd import GuidedStrategy
 from lerobot_agpd.config import GuidanceConfig
-from lerobot_agpd.guidance.strength import largest_strength
+from lerobot_agpd.guidance.pull import largest_pull
 from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.guidance.teacher_student import TeacherStudent
 from lerobot_agpd.replay.episode import Array
@@ -122,9 +122,8 @@ class TeacherProbe:
 
     def pulls(self) -> list[Pull]:
         """The teacher alone, guided if it can be, and the nearest of several samples."""
-        guided = self._guidance_strengths if self.teacher.can_be_guided else []
         settings: list[tuple[PullName, float]] = [("teacher", 0.0)]
-        settings += [("guided", strength) for strength in guided]
+        settings += [("guided", strength) for strength in self._guidance_strengths]
         settings += [("nearest", float(number)) for number in NEAREST_SAMPLES]
         chunks = {setting: self._pulled(*setting) for setting in settings}
         alone = _rms(chunks[settings[0]] - self.targets[:, None])
@@ -141,14 +140,17 @@ class TeacherProbe:
 
     @property
     def _guidance_strengths(self) -> list[float]:
-        """Those that the teacher's denoising steps can follow; scales of the same numbers if they are of no known form."""
-        largest = largest_strength(self.teacher, self._guidance)
+        """Pulls that the teacher's denoising steps can follow; none if these are of no known form."""
+        if self.teacher.sampler is None:
+            return []
+        largest = largest_pull(self.teacher.sampler, self._guidance.at)
         return [strength for strength in GUIDANCE_STRENGTHS if strength <= largest]
 
     @property
     def _guidance(self) -> GuidanceConfig:
-        at = self.student.config.guidance.at if self.student else self.teacher.guidance_points[0]
-        return GuidanceConfig(at=at) if self.teacher.sampler else GuidanceConfig(at=at, scale=1.0)
+        return GuidanceConfig(
+            at=self.student.config.guidance.at if self.student else self.teacher.guidance_points[0]
+        )
 
     def _pulled(self, name: PullName, strength: float) -> Tensor:
         """Chunks (S, PULLED, n, A) of a strategy in the teacher's normalized space."""
