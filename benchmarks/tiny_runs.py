@@ -27,7 +27,7 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.scripts import lerobot_train
 from point import make_demonstrations
 
-import lerobot_agpd.plugin  # noqa: F401
+from lerobot_agpd import plugin
 
 EPISODES, ROUNDS, STEPS = 4, 2, 6
 RUN = [
@@ -117,6 +117,7 @@ def _fork(flags: list[str], folder: Path, rank: int, n_ranks: int, port: int, in
             os.environ |= {name: str(value) for name, value in ranks.items()}
             os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
         sys.argv = ["lerobot-train", *flags]
+        plugin.warn_of_refused_command()  # as where a process of its own imports the plugin
         with inside(rank) if inside else nullcontext():
             lerobot_train.main()
         status = 0
@@ -124,7 +125,7 @@ def _fork(flags: list[str], folder: Path, rank: int, n_ranks: int, port: int, in
         status = end.code if isinstance(end.code, int) else 1
         sys.stderr.write(f"{end.code}\n" if isinstance(end.code, str) else "")
     except BaseException:
-        traceback.print_exc()
+        sys.excepthook(*sys.exc_info())  # type: ignore[arg-type]  # which a run may have exchanged
     finally:
         sys.stdout.flush(), sys.stderr.flush()
         os._exit(status)
