@@ -19,6 +19,7 @@ sys.path[:0] = [str(BENCHMARKS), str(BENCHMARKS.parent / "tests" / "plugins")]
 import faulty_point  # noqa: F401
 from fault import Bench, run_fault
 from faults import FAULTS
+from settings import refusals
 from tiny_runs import isolated, prepare, train
 
 from lerobot_agpd.files import write_json
@@ -31,6 +32,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="faults whose name contains this")
     options = parser.parse_args()
     results: dict[str, list[dict[str, object]]] = {}
+    settings: dict[str, str | None] = {}
     with tempfile.TemporaryDirectory() as temporary:
         source = Path(temporary) / "source"
         source.mkdir()
@@ -38,7 +40,9 @@ def main() -> None:
         codes = train([*flags, f"--output_dir={source / 'finished'}"], source / "finished-log")
         assert codes == [0], (source / "finished-log" / "rank-0.log").read_text()[-2000:]
         for group, faults in FAULTS.items():
-            for number, fault in enumerate(fault for fault in faults if any(word in fault.name for word in options.only.split(","))):
+            for number, fault in enumerate(
+                fault for fault in faults if any(word in fault.name for word in options.only.split(","))
+            ):
                 folder = Path(temporary) / f"{group}-{number}"
                 bench = Bench.create(folder, source, flags)
                 result = isolated(lambda fault=fault, bench=bench: asdict(run_fault(fault, bench)))
@@ -49,11 +53,17 @@ def main() -> None:
                 results.setdefault(group, []).append(result)
                 if as_expected:
                     shutil.rmtree(folder)
+        if not options.only:
+            settings = refusals()
     counts = [result["outcome"] for group in results.values() for result in group]
-    summary = {outcome: counts.count(outcome) for outcome in sorted(set(counts))}
-    write_json(
-        options.output, {"command": shlex.join(sys.argv), "outcomes": summary, "faults": results}, indent=1
-    )
+    content = {
+        "command": shlex.join(sys.argv),
+        "outcomes": {outcome: counts.count(outcome) for outcome in sorted(set(counts))},
+        "faults": results,
+        "settings": {"tried": len(settings), "named": sum(line is not None for line in settings.values())},
+        "settings_without_a_line": [name for name, line in settings.items() if line is None],
+    }
+    write_json(options.output, content, indent=1)
 
 
 if __name__ == "__main__":

@@ -32,17 +32,18 @@ def advice(command: Sequence[str]) -> list[str]:
     }
     resumes = (flags["resume"] or "").lower() == "true"
     config_path = Path(flags["config_path"]) if flags["config_path"] else None
-    found = _of_checkpoint(config_path) if resumes and config_path else _of_output(flags["output_dir"])
+    found = _of_checkpoint(config_path) if resumes else _of_output(flags["output_dir"])
     return [*found, *_of_demonstrations(flags, config_path)]
 
 
 # ---- checkpoints ----
 
 
-def _of_checkpoint(config_path: Path) -> Iterator[str]:
+def _of_checkpoint(config_path: Path | None) -> Iterator[str]:
     """A checkpoint `<run>/checkpoints/<step>/pretrained_model/train_config.json` that cannot be resumed."""
-    folder = next((path for path in config_path.parents if path.name == CHECKPOINTS_DIR), None)
-    if folder is None or not folder.parent.is_dir():
+    parents = config_path.parents if config_path else ()
+    folder = next((path for path in parents if path.name == CHECKPOINTS_DIR), None)
+    if config_path is None or folder is None or not folder.parent.is_dir():
         return
     run = folder.parent
     damaged = damaged_file(config_path.parents[1])

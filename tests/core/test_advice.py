@@ -1,5 +1,6 @@
 """What is said before LeRobot refuses a command: which file, which flag, and the way out."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -107,7 +108,9 @@ def test_demonstrations_of_a_resumed_run(save, recorded, tmp_path):
     """Named by the configuration of the checkpoint; the command line comes first."""
     root = shutil.copytree(recorded, tmp_path / "copy")
     config = save() / "pretrained_model" / "train_config.json"
-    config.write_text(config.read_text().replace('"repo_id": "local/point"', f'"root": "{root}"'))
+    content = json.loads(config.read_text())
+    content["dataset"]["root"] = str(root)
+    config.write_text(json.dumps(content))
     truncate(root / "meta" / "info.json")
     (text,) = advice([*RESUME, f"--config_path={config}"])
     assert f"--dataset.root={root}: {root / 'meta/info.json'} is damaged" in text
