@@ -11,10 +11,11 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.envs import EnvConfig
 
 from lerobot_agpd.config import StudentConfig, require
+from lerobot_agpd.continuation import damaged_file, how_to_continue
 from lerobot_agpd.guidance.strength import STEPS_FLAG, first_strength, require_strength
 from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.loading import check_fit, collection_environment, load_teacher
-from lerobot_agpd.progress import Progress, find_replay_root
+from lerobot_agpd.progress import REPLAY_FOLDER, Progress, find_replay_root
 from lerobot_agpd.replay.demonstrations import DemonstrationFrames
 from lerobot_agpd.replay.export import check_observation
 from lerobot_agpd.replay.journal import EpisodeJournal
@@ -88,6 +89,7 @@ def build_parts(
         "--parallelism.*: AGPD collects with whole policies, so it cannot shard them; use DDP",
     )
     progress = Progress.restore(config, run)
+    _require_intact(progress)
     demonstrations = DemonstrationFrames(config, dataset_meta, dataset_stats)
     meta = demonstrations.dataset.meta
     replay = Replay(demonstrations, config, config.replay.collected_fraction, run.image_transforms)
@@ -118,6 +120,24 @@ def build_parts(
         seed=seed,
         rank=processes.process_index,
     )
+
+
+def _require_intact(progress: Progress) -> None:
+    """Refuse a checkpoint with a damaged file, which LeRobot would read later, and name neither path nor remedy.
+
+    Raises:
+        ValueError: naming the file, and how the run goes on.
+    """
+    if progress.checkpoint is None:
+        return
+    folder = progress.checkpoint.parent
+    damaged = damaged_file(folder)
+    if damaged is not None:
+        run_folder = folder.parent.parent
+        raise ValueError(
+            f"{damaged} is damaged; restore it, or continue from another checkpoint: "
+            f"{how_to_continue(run_folder, run_folder / REPLAY_FOLDER)}"
+        )
 
 
 # ---- teacher ----

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from lerobot.utils.constants import (
 )
 from safetensors import SafetensorError, safe_open
 
-from lerobot_agpd.progress import REPLAY_FOLDER, STATE_FILE
+from lerobot_agpd.progress import STATE_FILE
 
 MODEL_FILES = (
     "config.json",
@@ -42,12 +41,21 @@ STATE_FILES = (TRAINING_STEP, RNG_STATE, OPTIMIZER_PARAM_GROUPS, OPTIMIZER_STATE
 
 def is_complete(checkpoint: Path) -> bool:
     """Whether every file of a checkpoint `<output_dir>/checkpoints/<step>` is there and readable."""
-    model, state = checkpoint / PRETRAINED_MODEL_DIR, checkpoint / TRAINING_STATE_DIR
-    files = [*(model / name for name in MODEL_FILES), *(state / name for name in STATE_FILES)]
-    if not all(map(_is_readable, files)):
+    if not all(map(_is_readable, _files(checkpoint))):
         return False
-    has_schedule = json.loads((model / TRAIN_CONFIG_NAME).read_text()).get("scheduler") is not None
-    return not has_schedule or _is_readable(state / SCHEDULER_STATE)
+    config = json.loads((checkpoint / PRETRAINED_MODEL_DIR / TRAIN_CONFIG_NAME).read_text())
+    return config.get("scheduler") is None or _is_readable(checkpoint / TRAINING_STATE_DIR / SCHEDULER_STATE)
+
+
+def damaged_file(checkpoint: Path) -> Path | None:
+    """The first file of a checkpoint that is there and cannot be read; None if there is none."""
+    files = [*_files(checkpoint), checkpoint / TRAINING_STATE_DIR / SCHEDULER_STATE]
+    return next((path for path in files if path.exists() and not _is_readable(path)), None)
+
+
+def _files(checkpoint: Path) -> list[Path]:
+    model, state = checkpoint / PRETRAINED_MODEL_DIR, checkpoint / TRAINING_STATE_DIR
+    return [*(model / name for name in MODEL_FILES), *(state / name for name in STATE_FILES)]
 
 
 def _is_readable(path: Path) -> bool:
@@ -116,49 +124,3 @@ def announcement(output_dir: Path, root: Path) -> str:
         f"{resume_flags(output_dir, last)}; before its first checkpoint (--save_freq) by the same command with other "
         f"values of two flags: {repeat_flags(output_dir, root)}"
     )
-
-
-# ---- commands that LeRobot refuses ----
-
-
-def advice(command: Sequence[str]) -> str | None:
-    """What a refused `lerobot-train` command of an interrupted run should have been; None for any other command.
-
-    LeRobot takes a missing checkpoint for a repository of the Hub, and refuses an output folder that exists, without a
-    word about the way out.
-
-    Args:
-        command: the program and its flags.
-    """
-    if Path(command[0]).stem.replace("_", "-") != "lerobot-train":
-        return None
-    config_path, output_dir = (_value(command, flag) for flag in ("--config_path", "--output_dir"))
-    resumes = (_value(command, "--resume") or "").lower() == "true"
-    if (
-        resumes
-        and config_path
-        and not Path(config_path).exists()
-        and CHECKPOINTS_DIR in Path(config_path).parts
-    ):
-        parents = Path(config_path).parents
-        run = next(path for path in parents if path.name == CHECKPOINTS_DIR).parent
-        if run.is_dir():
-            how = how_to_continue(run, run / REPLAY_FOLDER)
-            return f"--config_path={config_path} does not exist. If the run of {run} was interrupted, {how}"
-    if not resumes and output_dir and (Path(output_dir) / REPLAY_FOLDER).is_dir():
-        run = Path(output_dir)
-        return (
-            f"--output_dir={output_dir} holds an interrupted run; {how_to_continue(run, run / REPLAY_FOLDER)}"
-        )
-    return None
-
-
-def _value(command: Sequence[str], flag: str) -> str | None:
-    """Value of a flag, written `--flag=value` or `--flag value`; the last one counts."""
-    value = None
-    for position, word in enumerate(command):
-        if word.startswith(f"{flag}="):
-            value = word.removeprefix(f"{flag}=")
-        elif word == flag and position + 1 < len(command):
-            value = command[position + 1]
-    return value

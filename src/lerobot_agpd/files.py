@@ -27,12 +27,23 @@ BLOCK_BYTES = 16 * 2**20
 def atomic_file(path: Path) -> Iterator[BinaryIO]:
     """A file to write that has its name only once it is complete and on disk; for one writer at a time."""
     partial = path.with_name(f"{path.name}.partial")
-    with partial.open("wb") as file:
+    with _named_errors(partial), partial.open("wb") as file:
         yield file
         file.flush()
         os.fsync(file.fileno())
     partial.replace(path)
     _sync_folder(path.parent)
+
+
+@contextmanager
+def _named_errors(path: Path) -> Iterator[None]:
+    """Name the file in errors that do not: Python's own of a full disk says neither which file nor which disk."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None or error.errno is None:
+            raise
+        raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
 
 
 def _sync_folder(folder: Path) -> None:
@@ -81,7 +92,7 @@ def read_json(path: Path, remedy: str = "") -> dict[str, Any]:
 def append_line(path: Path, line: str) -> None:
     """Add a line and put it on disk; an incomplete last line, left by a killed process, is removed."""
     is_new = not path.exists()
-    with path.open("ab+") as file:
+    with _named_errors(path), path.open("ab+") as file:
         file.truncate(_complete_bytes(file))
         file.write(line.encode() + b"\n")
         file.flush()

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_agpd.continuation import advice
+from lerobot_agpd.advice import advice
 
 logger = logging.getLogger(__name__)
 
@@ -76,8 +76,7 @@ def register(
 def warn_of_refused_command() -> None:
     """Say what a `lerobot-train` command that LeRobot is about to refuse should have been."""
     is_main_process = multiprocessing.parent_process() is None and os.environ.get("RANK", "0") == "0"
-    text = advice(sys.argv) if is_main_process else None
-    if text is not None:
+    for text in advice(sys.argv) if is_main_process else ():
         logger.warning(text)
 
 

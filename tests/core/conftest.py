@@ -5,6 +5,9 @@ from pathlib import Path
 import pytest
 import torch
 import toy_run
+from lerobot.common.train_utils import save_checkpoint
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.policies import make_pre_post_processors
 from point_environment import PointEnv, PointTeacher, demonstrate
 from small_dataset import create_dataset
@@ -135,3 +138,26 @@ def start(agpd_config, point_demonstrations, toy_teacher, tmp_path):
         return Run(policy, point_demonstrations)
 
     return start
+
+
+@pytest.fixture
+def save(start, tmp_path):
+    """Saves a checkpoint of a toy run, by LeRobot's own function."""
+
+    def save(step=2):
+        run = start(steps=50)
+        run.agpd.progress.step = step
+        folder = tmp_path / "run" / "checkpoints" / f"{step:06d}"
+        dataset = DatasetConfig(repo_id="local/point")
+        config = TrainPipelineConfig(dataset=dataset, policy=run.policy.config, output_dir=tmp_path / "run")
+        config.policy.collect.env = None
+        save_checkpoint(folder, step, config, run.policy, run.optimizer, None, *run.processors)
+        return folder
+
+    return save
+
+
+@pytest.fixture
+def output_dir(tmp_path):
+    (tmp_path / "run" / "agpd").mkdir(parents=True, exist_ok=True)
+    return tmp_path / "run"

@@ -3,37 +3,9 @@
 import json
 import shutil
 
-import pytest
-from lerobot.common.train_utils import save_checkpoint, update_last_checkpoint
-from lerobot.configs.default import DatasetConfig
-from lerobot.configs.train import TrainPipelineConfig
-
-from lerobot_agpd.continuation import advice, announcement, how_to_continue, is_complete, newest_checkpoint
+from lerobot_agpd.continuation import announcement, how_to_continue, is_complete, newest_checkpoint
 
 RESUME = ["lerobot-train", "--resume=true"]
-
-
-@pytest.fixture
-def save(start, tmp_path):
-    """Saves a checkpoint of a toy run, by LeRobot's own function."""
-
-    def save(step=2):
-        run = start(steps=50)
-        run.agpd.progress.step = step
-        folder = tmp_path / "run" / "checkpoints" / f"{step:06d}"
-        dataset = DatasetConfig(repo_id="local/point")
-        config = TrainPipelineConfig(dataset=dataset, policy=run.policy.config, output_dir=tmp_path / "run")
-        config.policy.collect.env = None
-        save_checkpoint(folder, step, config, run.policy, run.optimizer, None, *run.processors)
-        return folder
-
-    return save
-
-
-@pytest.fixture
-def output_dir(tmp_path):
-    (tmp_path / "run" / "agpd").mkdir(parents=True, exist_ok=True)
-    return tmp_path / "run"
 
 
 def test_every_file_of_a_checkpoint_counts(save, output_dir):
@@ -82,46 +54,3 @@ def test_a_run_says_how_it_goes_on_when_its_first_round_begins(start, caplog, tm
         in text
     )
     assert f"--output_dir={tmp_path}/run-2 --policy.replay.root={run.agpd.journal.root}" in text
-
-
-# ---- commands that LeRobot refuses ----
-
-
-def test_a_missing_last_link(save, output_dir):
-    """LeRobot unlinks and links anew: killed in between, there is none."""
-    folder = save()
-    update_last_checkpoint(folder)
-    last = output_dir / "checkpoints" / "last"
-    command = [*RESUME, f"--config_path={last}/pretrained_model/train_config.json"]
-    assert advice(command) is None
-    last.unlink()
-    assert f"--config_path={folder}/pretrained_model/train_config.json --resume=true" in advice(command)
-    assert advice([*command[:-1], "--config_path", command[-1].partition("=")[2]]) == advice(command)
-
-
-def test_a_resume_before_the_first_checkpoint(output_dir):
-    last = output_dir / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
-    text = advice([*RESUME, f"--config_path={last}"])
-    assert f"{last} does not exist" in text and f"--policy.replay.root={output_dir / 'agpd'}" in text
-
-
-def test_the_original_command_again(output_dir):
-    command = ["/somewhere/lerobot_train.py", f"--output_dir={output_dir}"]
-    assert f"--policy.replay.root={output_dir / 'agpd'}" in advice(command)
-    assert advice([*command, "--resume=true"]) is None
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        ["lerobot-train", "--output_dir=new"],
-        ["lerobot-train"],
-        [*RESUME, "--config_path=someone/repository"],
-        [*RESUME, "--config_path=nowhere/checkpoints/last/pretrained_model/train_config.json"],
-        ["lerobot-eval", "--output_dir=run"],
-        ["-c"],
-    ],
-)
-def test_other_commands_are_left_alone(command, output_dir, monkeypatch):
-    monkeypatch.chdir(output_dir.parent)
-    assert advice(command) is None

@@ -15,8 +15,9 @@ from point_environment import PointEnv
 from safetensors.torch import load_file, save_file
 
 from lerobot_agpd.health.checkpoints import examine_checkpoints
+from lerobot_agpd.health.dataset import examine_dataset
 from lerobot_agpd.health.finding import Finding, Severity, is_broken
-from lerobot_agpd.health.run_folder import examine_dataset, examine_run
+from lerobot_agpd.health.run_folder import examine_run
 
 STEPS = 10
 

@@ -5,7 +5,6 @@ import shutil
 from pathlib import Path
 
 import draccus
-import numpy as np
 import pytest
 from commands import (
     PLUGINS,
@@ -20,8 +19,8 @@ from commands import (
 )
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import EnvConfig
+from point import make_demonstrations
 
 from lerobot_agpd.loading import read_policy_config
 
@@ -46,21 +45,7 @@ def install(package: str, folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory) -> Path:
-    """Walks straight to the goal, which need no environment."""
-    root = tmp_path_factory.mktemp("point") / "demos"
-    vector = {"dtype": "float32", "shape": (2,), "names": None}
-    keys = ("observation.state", "observation.environment_state", "action")
-    dataset = LeRobotDataset.create(
-        "local/test", fps=10, features=dict.fromkeys(keys, vector), root=root, use_videos=False
-    )
-    for angle in np.linspace(0, 2 * np.pi, 12, endpoint=False):
-        goal = np.array([np.cos(angle), np.sin(angle)], dtype=np.float32)
-        for step in range(8):
-            values = (goal * min(step / 4, 1), goal, goal * (step < 4))
-            dataset.add_frame({**dict(zip(keys, map(np.float32, values), strict=True)), "task": "walk"})
-        dataset.save_episode()
-    dataset.finalize()
-    return root
+    return make_demonstrations(tmp_path_factory.mktemp("point") / "demos")
 
 
 @pytest.fixture(scope="module")

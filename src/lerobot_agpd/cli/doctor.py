@@ -11,9 +11,10 @@ from rich.table import Table
 from lerobot_agpd.cli.command import entry_point
 from lerobot_agpd.config import require
 from lerobot_agpd.files import write_json
+from lerobot_agpd.health.dataset import examine_dataset
 from lerobot_agpd.health.finding import Finding, Severity, is_broken
 from lerobot_agpd.health.installation import examine_installation
-from lerobot_agpd.health.run_folder import examine_dataset, examine_run
+from lerobot_agpd.health.run_folder import examine_run
 
 STYLES = {
     Severity.OK: "green",
