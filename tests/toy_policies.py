@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 
-from lerobot_agpd.guidance.discrepancy import gradient
 from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.guidance.teacher_student import TeacherStudent
 
@@ -53,7 +52,7 @@ class NoisyTeacher(Teacher):
         noise = torch.randn(len(state), N_CHUNK + self.start, self.action_dim, generator=generator)
         chunk = self.normalize(self.mean_action(state[:, -1]))[:, None] + self.spread * noise
         if guide is not None:
-            step = gradient(guide.discrepancy, chunk)[1]
+            step = guide.discrepancy.gradient(chunk)
             chunk = chunk - guide.scale[:, None, None] * step
             guide.shift_in_sigmas.append(guide.scale)
         return self.unnormalize(chunk[:, self.start :])

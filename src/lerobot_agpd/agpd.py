@@ -202,7 +202,6 @@ class AGPD:
             Whether this was the last step of the run.
         """
         before, self.progress.step = self.progress.step, self.progress.step + self.run.steps_per_update
-        self.progress.seen_episodes = sorted(self.replay.seen_episodes)
         due = rounds_due(self.progress.step, self.config.collect)
         is_last = self.progress.step + self.run.steps_per_update > (self.run.steps or math.inf)
         # None after the last step, because no student would learn from it.
@@ -382,6 +381,7 @@ class AGPD:
 
     def save(self, folder: Path) -> None:
         """Write what a resumed run must know beside a checkpoint's weights."""
+        self.progress.seen_episodes = sorted(self.replay.seen_episodes)
         self.progress.save(folder)
         if self.self_teacher is not None:
             self.self_teacher.save(folder)

@@ -93,7 +93,7 @@ def build_parts(
     demonstrations = DemonstrationFrames(config, dataset_meta, dataset_stats)
     meta = demonstrations.dataset.meta
     replay = Replay(demonstrations, config, config.replay.collected_fraction, run.image_transforms)
-    replay.seen_episodes.update(progress.seen_episodes)
+    replay.see(progress.seen_episodes)
     self_teacher = _self_teacher(student, progress)
     teacher = None if self_teacher else _teacher(config)
     env_config = collection_environment(config.collect, run) if config.collect.enabled else None

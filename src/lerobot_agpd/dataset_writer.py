@@ -16,7 +16,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lerobot.datasets.aggregate import aggregate_datasets
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_agpd.dataset_table import EpisodeTable
 
 logger = logging.getLogger(__name__)
 
@@ -28,6 +31,9 @@ Feature = dict[str, Any]
 
 JsonDict = Mapping[str, Any]
 PLAN = "plan.json"
+
+CAMERAS = ("image", "video")
+"""Dtypes of camera features."""
 
 
 def vector(dim: int) -> Feature:
@@ -153,11 +159,37 @@ class DatasetWriter:
             return folder
         unfinished = self.partial_root / "unfinished"
         shutil.rmtree(unfinished, ignore_errors=True)
+        has_cameras = any(feature["dtype"] in CAMERAS for feature in self.features.values())
+        n_episodes = (self._record if has_cameras else self._write_table)(unfinished, episodes, on_episode)
+        if not n_episodes:
+            raise ValueError(f"no episode to write to {self.root}")
+        unfinished.rename(folder)
+        return folder
+
+    def _write_table(
+        self, root: Path, episodes: Iterable[Iterable[Frame]], on_episode: Callable[[], None]
+    ) -> int:
+        """Write a dataset without cameras; returns its number of episodes."""
+        meta = LeRobotDatasetMetadata.create(
+            self.repo_id, self.fps, self.features, self.robot_type, root, use_videos=False
+        )
+        table = EpisodeTable(meta)
+        try:
+            for frames in episodes:
+                table.add(frames)
+                on_episode()
+            table.finish()
+        finally:  # as below
+            meta.finalize()
+        return meta.total_episodes
+
+    def _record(self, root: Path, episodes: Iterable[Iterable[Frame]], on_episode: Callable[[], None]) -> int:
+        """Write a dataset with cameras, as LeRobot records; returns its number of episodes."""
         dataset = LeRobotDataset.create(
             self.repo_id,
             fps=self.fps,
             features=self.features,
-            root=unfinished,
+            root=root,
             robot_type=self.robot_type,
             use_videos=self.use_videos,
         )
@@ -169,10 +201,7 @@ class DatasetWriter:
                 on_episode()
         finally:  # LeRobot would do it at garbage collection, and create a folder again that was removed
             dataset.finalize()
-        if not dataset.num_episodes:
-            raise ValueError(f"no episode to write to {self.root}")
-        unfinished.rename(folder)
-        return folder
+        return dataset.num_episodes
 
     def _merged(self, shards: list[Path]) -> Path:
         """Return the folder of all shards as one dataset."""

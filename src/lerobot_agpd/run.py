@@ -5,11 +5,12 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import EnvConfig
 from lerobot.transforms import ImageTransforms
 from torch import Tensor
@@ -28,6 +29,7 @@ class RunInfo:
         image_transforms: what the loader does to training images (..., C, H, W), or None.
         lerobot_ema: whether LeRobot keeps averaged weights of its own (`--ema.enable`).
         sharded: whether parameters are spread over processes (`--parallelism.*`, FSDP).
+        datasets: what the run's loaders read.
     """
 
     output_dir: Path | None = None
@@ -38,6 +40,7 @@ class RunInfo:
     image_transforms: Callable[[Tensor], Tensor] | None = None
     lerobot_ema: bool = False
     sharded: bool = False
+    datasets: tuple[LeRobotDataset, ...] = field(default=(), compare=False, repr=False)
 
     @classmethod
     def from_train_config(cls, config: TrainPipelineConfig) -> RunInfo:
@@ -67,16 +70,19 @@ class RunInfo:
 
         LeRobot tells a policy neither its output folder nor its environment, and re-reading the command line would
         miss `train(config)` called from Python. Both ways hold the same object: the TrainPipelineConfig whose `policy`
-        is this very configuration, in a function that is building the policy right now.
+        is this very configuration, in a function that is building the policy right now. The datasets that its loaders
+        will read are beside it.
         """
-        configs = (config for config in _train_configs_of_callers() if config.policy is policy_config)
-        return next((cls.from_train_config(config) for config in configs), None)
+        for values in _locals_of_callers():
+            for config in values:
+                if isinstance(config, TrainPipelineConfig) and config.policy is policy_config:
+                    datasets = tuple(value for value in values if isinstance(value, LeRobotDataset))
+                    return replace(cls.from_train_config(config), datasets=datasets)
+        return None
 
 
-def _train_configs_of_callers() -> Iterator[TrainPipelineConfig]:
+def _locals_of_callers() -> Iterator[list[object]]:
     frame = inspect.currentframe()
     while frame is not None:
-        for value in frame.f_locals.values():
-            if isinstance(value, TrainPipelineConfig):
-                yield value
+        yield list(frame.f_locals.values())
         frame = frame.f_back

@@ -6,7 +6,7 @@ from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.processor import NormalizerProcessorStep
 
 from lerobot_agpd.guidance.action_normalizer import ActionNormalizer
-from lerobot_agpd.guidance.discrepancy import ActionDiscrepancy, gradient
+from lerobot_agpd.guidance.discrepancy import ActionDiscrepancy
 
 STATS = {"min": [0.0, 0.3], "max": [4.0, 0.3], "mean": [1.0, 0.3], "std": [2.0, 0.0]}
 
@@ -32,9 +32,9 @@ def test_a_constant_dimension_gets_the_value_it_has_in_the_data(mode, expected, 
 def test_a_constant_dimension_does_not_dominate_j():
     """The teacher predicts -1 there, up to its noise; the student is off by 1e-4, 20000 of LeRobot's units."""
     target = normalizer(NormalizationMode.MIN_MAX).normalize(torch.tensor([[[3.0, 0.3001]]]))  # (B, n, A)
-    j, grad = gradient(ActionDiscrepancy(target, 0), torch.tensor([[[0.0, -0.98]]]))
-    assert j.item() == pytest.approx(0.5 * (0.5**2 + 0.02**2))
-    assert grad.flatten().tolist() == pytest.approx([-0.5, 0.02])
+    action_j, chunk = ActionDiscrepancy(target, 0), torch.tensor([[[0.0, -0.98]]])
+    assert action_j(chunk).item() == pytest.approx(0.5 * (0.5**2 + 0.02**2))
+    assert action_j.gradient(chunk).flatten().tolist() == pytest.approx([-0.5, 0.02])
 
 
 def test_a_dimension_with_a_floored_spread_is_not_constant():

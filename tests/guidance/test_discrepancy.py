@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from lerobot_agpd.guidance.discrepancy import ActionDiscrepancy, StateDiscrepancy, gradient
+from lerobot_agpd.guidance.discrepancy import ActionDiscrepancy, StateDiscrepancy
 from lerobot_agpd.guidance.representation import StateRepresentation, reconstruction_loss
 
 B, H, N, A, D, START = 3, 6, 2, 2, 4, 1
@@ -26,45 +26,50 @@ def state_j():
 def test_action_discrepancy_by_hand():
     target = torch.tensor([[[1.0, 2.0], [0.0, -1.0]]])
     chunk = torch.tensor([[[9.0, 9.0], [2.0, 2.0], [3.0, 1.0], [9.0, 9.0]]])
-    j, grad = gradient(ActionDiscrepancy(target, start=1), chunk)
-    assert j.tolist() == [7.0]  # (1 + 0 + 9 + 4) / 2
-    assert grad.tolist() == [[[0, 0], [1, 0], [3, 2], [0, 0]]]
+    action_j = ActionDiscrepancy(target, start=1)
+    assert action_j(chunk).tolist() == [7.0]  # (1 + 0 + 9 + 4) / 2
+    assert action_j.gradient(chunk).tolist() == [[[0, 0], [1, 0], [3, 2], [0, 0]]]
 
 
-def test_rows_do_not_mix():
-    chunk = torch.randn(B, H, A)
-    j, grad = gradient(ActionDiscrepancy(torch.zeros(B, N, A), START), chunk)
-    executed = chunk[:, START : START + N]
-    torch.testing.assert_close(j, 0.5 * executed.square().sum(dim=(1, 2)))
-    torch.testing.assert_close(grad[:, START : START + N], executed)
-    assert (grad[:, START + N :] == 0).all() and (grad[:, :START] == 0).all()
+def test_the_closed_form_is_the_gradient():
+    """To the last bit: guided chunks do not depend on how the gradient is computed."""
+    action_j, chunk = ActionDiscrepancy(torch.randn(B, N, A), START), torch.randn(B, H, A, requires_grad=True)
+    (expected,) = torch.autograd.grad(action_j(chunk).sum(), chunk)
+    assert torch.equal(action_j.gradient(chunk.detach()), expected)
+    assert (expected[:, START : START + N] != 0).all()
 
 
-def test_gradient_works_under_no_grad_and_leaves_the_chunk_alone():
+def test_gradient_works_under_no_grad_and_leaves_the_chunk_alone(state_j):
     chunk = torch.randn(B, H, A)
     with torch.no_grad():
-        j, grad = gradient(ActionDiscrepancy(torch.zeros(B, N, A), START), chunk)
-    assert not (j.requires_grad or grad.requires_grad or chunk.requires_grad)
-    assert grad.abs().sum() > 0
+        grads = [discrepancy.gradient(chunk) for discrepancy in (state_j, state_j.reference)]
+    assert not chunk.requires_grad
+    assert all(not grad.requires_grad and grad.abs().sum() > 0 for grad in grads)
 
 
 def test_state_discrepancy_by_hand(state_j):
-    """Up to its constant factor, J is the squared distance of the two predicted observations."""
+    """J is the squared distance of the two predicted observations."""
     chunk = torch.randn(B, H, A)
     executed = to_student(chunk[:, START : START + N])
-    gap = state_j.representation(state_j.observation, executed) - state_j.representation(
-        state_j.observation, state_j.target
-    )
-    ratio = gradient(state_j, chunk)[0] / gap.square().sum(dim=1)
-    torch.testing.assert_close(ratio, ratio[:1].expand(B))
-    assert ratio[0] > 0
+    predict = state_j.representation
+    gap = predict(state_j.observation, executed) - predict(state_j.observation, state_j.target)
+    torch.testing.assert_close(state_j(chunk), gap.square().sum(dim=1))
+
+
+def test_state_discrepancy_follows_its_own_gradient(state_j):
+    """Up to one factor for the batch."""
+    chunk = torch.randn(B, H, A, requires_grad=True)
+    (exact,) = torch.autograd.grad(state_j(chunk).sum(), chunk)
+    grad, moved = state_j.gradient(chunk.detach()), exact != 0
+    factors = grad[moved] / exact[moved]
+    torch.testing.assert_close(factors, factors[:1].expand(len(factors)), rtol=1e-3, atol=0)
 
 
 def test_state_discrepancy_has_the_action_gradients_mean_norm(state_j):
     chunk = torch.randn(B, H, A)
     with torch.no_grad():
-        grad = gradient(state_j, chunk)[1]
-        reference = gradient(state_j.reference, chunk)[1]
+        grad = state_j.gradient(chunk)
+        reference = state_j.reference.gradient(chunk)
     norms = grad.flatten(1).norm(dim=1)
     torch.testing.assert_close(norms.mean(), reference.flatten(1).norm(dim=1).mean())
     assert norms.std() > 1e-4  # one factor for the batch, not one per row
@@ -73,7 +78,7 @@ def test_state_discrepancy_has_the_action_gradients_mean_norm(state_j):
 
 def test_a_small_step_against_the_gradient_brings_the_futures_closer(state_j):
     chunk = torch.randn(B, H, A)
-    grad = gradient(state_j, chunk)[1]
+    grad = state_j.gradient(chunk)
     closer, now, farther = (state_j(chunk + step * grad) for step in (-1e-2, 0.0, 1e-2))
     assert (closer < now).all() and (now < farther).all()
 
@@ -82,12 +87,11 @@ def test_equal_chunks_have_no_discrepancy(state_j):
     chunk = torch.randn(B, H, A)
     chunk[:, START : START + N] = state_j.reference.target
     for discrepancy in (state_j, state_j.reference):
-        j, grad = gradient(discrepancy, chunk)
-        assert (j == 0).all() and (grad == 0).all()
+        assert (discrepancy(chunk) == 0).all() and (discrepancy.gradient(chunk) == 0).all()
 
 
 def test_representation_gets_no_gradient(state_j):
-    gradient(state_j, torch.randn(B, H, A))
+    state_j.gradient(torch.randn(B, H, A))
     assert all(parameter.grad is None for parameter in state_j.representation.parameters())
 
 

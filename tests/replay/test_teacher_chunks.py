@@ -43,7 +43,7 @@ def chunks(replay):
 
 def raw(chunks, frames, seen=()):
     """The teacher's steps in raw units, and the others, after the loader has delivered the episodes `seen`."""
-    chunks.replay.seen_episodes.update(seen)
+    chunks.replay.see(seen)
     found, shared = chunks.at(torch.tensor(frames))
     normalizer = chunks.replay.demonstrations.normalizer
     return normalizer.unnormalize("action", found[:, :shared]), found[:, shared:]

@@ -1,20 +1,30 @@
 """The discrepancy J between a teacher's chunk and the student's (section 4.2, appendix A.4).
 
 A discrepancy is a function of the teacher's chunk, (B, H, A) in the teacher's normalized space, that returns
-J for every row, (B,). It is differentiable, and the student's chunk is fixed inside it.
+J for every row, (B,), and knows its gradient. The student's chunk is fixed inside it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from lerobot_agpd.guidance.representation import StateRepresentation
 
-Discrepancy = Callable[[Tensor], Tensor]
+
+class Discrepancy(Protocol):
+    """J as guidance needs it."""
+
+    def __call__(self, chunk: Tensor) -> Tensor:
+        """J of every row, (B,), for chunks (B, H, A)."""
+
+    def gradient(self, chunk: Tensor) -> Tensor:
+        """What guidance follows downhill: the gradient of J with respect to the chunk, (B, H, A), up to one factor."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +41,16 @@ class ActionDiscrepancy:
 
     def __call__(self, chunk: Tensor) -> Tensor:
         """J of every row, (B,), for chunks (B, H, A)."""
-        executed = chunk[:, self.start : self.start + self.target.shape[1]]
-        return 0.5 * (executed - self.target).square().sum(dim=(1, 2))
+        return 0.5 * self._gap(chunk).square().sum(dim=(1, 2))
+
+    def gradient(self, chunk: Tensor) -> Tensor:
+        """A - A_hat on the executed steps, 0 elsewhere, (B, H, A)."""
+        grad = torch.zeros_like(chunk)
+        grad[:, self.start : self.start + self.target.shape[1]] = self._gap(chunk)
+        return grad
+
+    def _gap(self, chunk: Tensor) -> Tensor:
+        return chunk[:, self.start : self.start + self.target.shape[1]] - self.target
 
 
 @dataclass(frozen=True)
@@ -60,27 +78,24 @@ class StateDiscrepancy:
         """J of every row, (B,), for chunks (B, H, A)."""
         start, n_steps = self.reference.start, self.target.shape[1]
         executed = self.to_student(chunk[:, start : start + n_steps])
-        gap = self.representation(self.observation, executed) - self.representation(
-            self.observation, self.target
+        gap = self.representation(self.observation, executed) - self._target_future
+        return gap.square().sum(dim=1)
+
+    @cached_property
+    def _target_future(self) -> Tensor:
+        """What the student's steps lead to, (B, D): predicted once, not at every denoising step."""
+        with torch.no_grad():
+            return self.representation(self.observation, self.target)
+
+    def gradient(self, chunk: Tensor) -> Tensor:
+        """The gradient, (B, H, A), times one factor for the batch; works inside `no_grad`.
+
+        Inside `inference_mode` no gradient exists; leave it first.
+        """
+        with torch.enable_grad():
+            point = chunk.detach().requires_grad_(True)
+            (grad,) = torch.autograd.grad(self(point).sum(), point)
+        own, wanted = (
+            values.flatten(1).norm(dim=1).mean() for values in (grad, self.reference.gradient(chunk))
         )
-        squared = gap.square().sum(dim=1)
-        return squared * self._rescaling(squared, chunk)
-
-    def _rescaling(self, squared: Tensor, chunk: Tensor) -> Tensor:
-        """Mean gradient norm of the action J over that of this J; a constant factor."""
-        if not chunk.requires_grad:
-            return torch.ones((), device=chunk.device)
-        own = torch.autograd.grad(squared.sum(), chunk, retain_graph=True)[0].flatten(1).norm(dim=1).mean()
-        reference = gradient(self.reference, chunk)[1].flatten(1).norm(dim=1).mean()
-        return (reference / own.clamp_min(1e-12)).detach()
-
-
-def gradient(discrepancy: Discrepancy, chunk: Tensor) -> tuple[Tensor, Tensor]:
-    """J, (B,), and its gradient with respect to the chunk, (B, H, A); works inside `no_grad`.
-
-    Inside `inference_mode` no gradient exists; leave it first.
-    """
-    with torch.enable_grad():
-        chunk = chunk.detach().clone().requires_grad_(True)
-        value = discrepancy(chunk)
-        return value.detach(), torch.autograd.grad(value.sum(), chunk)[0]
+        return grad * (wanted / own.clamp_min(1e-12))

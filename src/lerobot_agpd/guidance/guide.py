@@ -20,7 +20,7 @@ from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 from torch import Tensor, nn
 
 from lerobot_agpd.config import GuidancePoint
-from lerobot_agpd.guidance.discrepancy import Discrepancy, gradient
+from lerobot_agpd.guidance.discrepancy import Discrepancy
 
 TRUST_REGION = 1.0
 """Largest shift of a denoising step, as a multiple of that step's sigma."""
@@ -127,7 +127,7 @@ class Guide:
         TRUST_REGION sigmas, so that a guided step stays as likely as a large draw of the teacher's noise.
         """
         point = step.x0_hat if self.at == "x0" else step.mean
-        discrepancy, grad = gradient(self.discrepancy, point)
+        grad = self.discrepancy.gradient(point)
         sigma = step.variance**0.5
         factor = (self.scale * step.variance).clamp(max=1.0).to(grad)  # (B,)
         shift = -factor[:, None, None] * grad  # (B, H, A)
@@ -137,7 +137,7 @@ class Guide:
         if sigma > 0:
             self.shift_in_sigmas.append(length * cap / sigma)
         if self.callback is not None:
-            self.callback(GuidedStep(timestep, sigma, discrepancy, shift, step.x0_hat))
+            self.callback(GuidedStep(timestep, sigma, self.discrepancy(point), shift, step.x0_hat))
         return shift
 
 
@@ -179,5 +179,5 @@ def guided(model: nn.Module, guide: Guide | None) -> Iterator[None]:
 def _rms_over_nonzero(shift: Tensor) -> Tensor:
     """Root mean square of every row over its nonzero entries, (B,): unguided steps do not dilute it."""
     flat = shift.flatten(1)
-    count = (flat != 0).sum(dim=1).clamp_min(1)
+    count = flat.count_nonzero(dim=1).clamp_min(1)
     return (flat.square().sum(dim=1) / count).sqrt()

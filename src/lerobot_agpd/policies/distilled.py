@@ -3,7 +3,7 @@
 import logging
 import math
 import weakref
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,10 +21,12 @@ from lerobot_agpd.config import StudentConfig, require
 from lerobot_agpd.continuation import how_to_continue
 from lerobot_agpd.guidance.representation import LR, StateRepresentation
 from lerobot_agpd.interrupts import InterruptMessage
+from lerobot_agpd.policies.fused_groups import ParameterGroup, fused_groups
 from lerobot_agpd.policies.gradient_norms import GradientNorms
 from lerobot_agpd.replay.demonstrations import delivers_single_frames
 from lerobot_agpd.replay.export import merge
 from lerobot_agpd.replay.normalization import Statistics
+from lerobot_agpd.replay.served_frames import serve_from_memory
 from lerobot_agpd.run import RunInfo
 from lerobot_agpd.student import Student
 from lerobot_agpd.weights import not_finite_weight, require_weights
@@ -77,6 +79,8 @@ class DistilledPolicy(Student):
         self._gradient_norms = GradientNorms(self.parameter_groups())
         self._last_norms: dict[str, float] = {}
         is_lerobots, run = run is None, run or RunInfo.of(config)
+        for dataset in run.datasets if run else ():
+            serve_from_memory(dataset)
         self._training_data = (dataset_meta, dataset_stats, run or RunInfo())
         self._agpd: AGPD | None = None
         if run is not None and dataset_meta is not None:
@@ -201,17 +205,17 @@ class DistilledPolicy(Student):
                 groups[owner if owner in groups else "student"].append(parameter)
         return groups
 
-    def get_optim_params(self) -> list[dict[str, Any]]:
+    def get_optim_params(self) -> list[ParameterGroup]:
         """The student's own groups, then one each for discriminator and representation if there are any."""
         groups = self.parameter_groups()
         own = {id(parameter) for parameter in groups["student"]}
         params = [
             {**group, "params": [p for p in group["params"] if id(p) in own]}
-            for group in _as_groups(super().get_optim_params())  # type: ignore[misc]
+            for group in fused_groups(super().get_optim_params())  # type: ignore[misc]
         ]
         for name, lr in (("discriminator", self.config.adversary.lr), ("representation", LR)):
             if groups[name]:
-                params.append({"params": groups[name], "lr": lr})
+                params += fused_groups([{"params": groups[name], "lr": lr}])
         return params
 
     # ---- checkpoints ----
@@ -240,9 +244,3 @@ def vector_dim(config: StudentConfig) -> int:
         f"{list(features)}; use --policy.representation.type=action",
     )
     return sum(features[key].shape[0] for key in config.observed_vectors)
-
-
-def _as_groups(params: Iterable[Any]) -> list[dict[str, Any]]:
-    """Optimizer parameters as a list of groups."""
-    entries = list(params)
-    return entries if entries and isinstance(entries[0], dict) else [{"params": entries}]

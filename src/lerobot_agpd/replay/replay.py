@@ -95,7 +95,7 @@ class Replay:
         self._fixed_fraction = collected_fraction
         self._demonstrated_starts = (self.table.lengths - n_dropped).clamp(min=0)  # (E,)
         self._collected_starts = ChunkStarts(n_dropped)
-        self._n_seen = (0, 0)  # seen episodes, and the frames of theirs that may begin a chunk
+        self._n_seen_starts = 0  # frames of seen episodes that may begin a chunk
         self._cameras = list(config.image_features)
 
     # ---- contents ----
@@ -139,7 +139,14 @@ class Replay:
     def observe(self, batch: Batch) -> None:
         """Note the statistics and the episodes of a batch that the loader delivers in training."""
         self.demonstrations.observe(batch)
-        self.seen_episodes.update(batch["episode_index"].tolist())
+        self.see(batch["episode_index"].tolist())
+
+    def see(self, episodes: Iterable[int]) -> None:
+        """Note demonstrations that the loader delivers in training."""
+        new = sorted(set(episodes) - self.seen_episodes)
+        if new:
+            self.seen_episodes.update(new)
+            self._n_seen_starts += int(self._demonstrated_starts[new].sum())
 
     @property
     def collected_fraction(self) -> float:
@@ -150,10 +157,7 @@ class Replay:
         if self._fixed_fraction is not None:
             return self._fixed_fraction
         # Uniform over the frames that begin a chunk: on both sides, an episode's dropped ones do not count.
-        if self._n_seen[0] != len(self.seen_episodes):  # seen episodes are only ever added
-            n_starts = int(self._demonstrated_starts[sorted(self.seen_episodes)].sum())
-            self._n_seen = (len(self.seen_episodes), n_starts)
-        return n_collected / (self._n_seen[1] + n_collected)
+        return n_collected / (self._n_seen_starts + n_collected)
 
     def train_batch(self, batch: Batch, generator: torch.Generator) -> Batch:
         """A batch of T for a training step: the loader's frames, a fraction exchanged for collected ones."""

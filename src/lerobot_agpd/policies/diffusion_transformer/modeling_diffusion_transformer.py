@@ -1,6 +1,5 @@
 """LeRobot's diffusion policy with an exchangeable denoiser, averaged weights and chunks cut from memory."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
 
@@ -9,7 +8,7 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.policies.diffusion.modeling_diffusion import DiffusionModel, DiffusionPolicy
 from lerobot.utils.constants import ACTION
-from torch import Tensor, nn
+from torch import Tensor
 
 from lerobot_agpd.config import require
 from lerobot_agpd.policies.diffusion_transformer.averaged_weights import AveragedWeights
@@ -17,9 +16,11 @@ from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transfo
     DiffusionTransformerConfig,
 )
 from lerobot_agpd.policies.diffusion_transformer.model import DenoisingModel
-from lerobot_agpd.policies.diffusion_transformer.transformer import ParameterGroup, weight_decay_groups
+from lerobot_agpd.policies.diffusion_transformer.transformer import weight_decay_groups
+from lerobot_agpd.policies.fused_groups import ParameterGroup, fused_groups
 from lerobot_agpd.replay.demonstrations import DemonstrationFrames, delivers_single_frames
 from lerobot_agpd.replay.normalization import Statistics
+from lerobot_agpd.replay.served_frames import serve_from_memory
 from lerobot_agpd.run import RunInfo
 from lerobot_agpd.weights import is_main_process, require_weights
 
@@ -51,6 +52,8 @@ class DiffusionTransformerPolicy(DiffusionPolicy):
         config.validate_features()
         self.config: DiffusionTransformerConfig = config
         self.run = run or RunInfo.of(config) or RunInfo()
+        for dataset in self.run.datasets:
+            serve_from_memory(dataset)
         if config.ema:
             _check_averaging(self.run)
         self.diffusion = self.model_class(config)
@@ -59,11 +62,11 @@ class DiffusionTransformerPolicy(DiffusionPolicy):
         self._demonstrations: DemonstrationFrames | None = None
         self._average: AveragedWeights | None = None
 
-    def get_optim_params(self) -> list[ParameterGroup] | Iterator[nn.Parameter]:  # type: ignore[override, unused-ignore]
+    def get_optim_params(self) -> list[ParameterGroup]:  # type: ignore[override, unused-ignore]
         """Parameters for the optimizer; with a transformer, weight decay is for its matrices alone."""
         if self.config.denoiser == "transformer":
-            return weight_decay_groups(self.diffusion)
-        return self.diffusion.parameters()
+            return fused_groups(weight_decay_groups(self.diffusion))
+        return fused_groups(self.diffusion.parameters())
 
     # ---- training ----
 

@@ -9,9 +9,7 @@ from torch import Tensor, nn
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
     TransformerDenoiserConfig,
 )
-
-ParameterGroup = dict[str, list[nn.Parameter] | float]
-"""Parameters of an optimizer under "params", and the options that are theirs alone."""
+from lerobot_agpd.policies.fused_groups import ParameterGroup
 
 INIT_STD = 0.02
 """Standard deviation of every initial matrix and position, as in the authors' transformer_for_diffusion.py."""
