@@ -19,6 +19,7 @@ from lerobot_agpd.studies.results import (
     difference,
     pooled,
 )
+from lerobot_agpd.studies.ways import RoundWays
 
 Row = tuple[str, ...]
 
@@ -219,6 +220,17 @@ def ways_table(methods: Methods) -> list[Row]:
         if cells:
             rows.append((name, *cells, *[""] * (longest - len(cells))))
     return rows if longest else []
+
+
+def round_ways_table(ways: Sequence[RoundWays]) -> list[Row]:
+    """One row per collection round of a run: kept episodes on every way, and their entropy; empty without ways."""
+    if not ways:
+        return []
+    header = ("round", *(f"way {way}" for way in range(len(ways[0].total))), "entropy")
+    rows = [
+        (str(number), *map(str, round_.total), f"{round_.entropy:.2f}") for number, round_ in enumerate(ways)
+    ]
+    return [header, *rows]
 
 
 def rounds_table(rounds: Sequence[RoundReport]) -> list[Row]:
