@@ -23,9 +23,14 @@ STRATEGIES = {
 }
 """`collect.strategy` to who acts."""
 
-EXPLANATION = """\
-A frozen teacher acted in the environment, the episodes that succeeded joined the demonstrations, and the student
-imitated both (*Adaptive Guidance Policy Distillation*). It needs neither teacher nor dataset to act."""
+COLLECTED = """\
+A frozen teacher acted in simulation, the episodes that succeeded joined the demonstrations, and the policy imitated both
+(*Adaptive Guidance Policy Distillation*, AGPD). It needs neither teacher nor dataset to act."""
+
+OFFLINE = """\
+It was distilled from a frozen teacher at the states of the demonstrations. It needs neither teacher nor dataset to act."""
+
+CLONED = "It imitates demonstrations."
 
 
 def distillation_facts(agpd: AGPD, n_parameters: int, dataset: LeRobotDatasetMetadata) -> ModelFacts:
@@ -49,9 +54,10 @@ def distillation_facts(agpd: AGPD, n_parameters: int, dataset: LeRobotDatasetMet
         "training steps": f"{progress.step} of {agpd.run.steps or 'unknown'}",
     }
     kind = KINDS.get(config.type, config.type)
+    explanation = COLLECTED if config.collect.enabled else OFFLINE if config.uses_teacher else CLONED
     article = "An" if kind[0] in "AEIOU" else "A"
     return ModelFacts(
-        summary=f"{article} {kind} policy for [LeRobot](https://github.com/huggingface/lerobot). {EXPLANATION}",
+        summary=f"{article} {kind} policy for [LeRobot](https://github.com/huggingface/lerobot). {explanation}",
         facts=facts,
         dataset=dataset.repo_id,
         base_model=teacher if on_hub else None,

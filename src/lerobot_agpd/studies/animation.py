@@ -96,8 +96,11 @@ def write_animation(rows: Mapping[str, Sequence[Clip]], path: Path, style: Style
         write_video(path, [np.asarray(frame) for frame in frames], fps=round(style.fps))
         return
     # One palette for all frames, taken from all over the film: GIF then stores what changes alone.
-    sample = Image.fromarray(np.concatenate([np.asarray(frame) for frame in frames[:: len(frames) // 8 + 1]]))
-    palette = sample.quantize(COLORS)
+    shown = [np.asarray(frame) for frame in frames[:: len(frames) // 8 + 1]]
+    swatches = [
+        np.full_like(shown[0], color) for color in (SUCCESS, FAILURE)
+    ]  # thin borders would get no color
+    palette = Image.fromarray(np.concatenate(shown + swatches)).quantize(COLORS)
     first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     first.save(
         path, save_all=True, append_images=others, duration=round(1000 / style.fps), loop=0, optimize=True

@@ -78,8 +78,37 @@ def summary_table(results: Sequence[Result]) -> list[Row]:
 # ---- a comparison ----
 
 
+def outcome_table(methods: Methods, measure: str, reference: str | None) -> list[Row]:
+    """What to look at first: the task's measure at the last checkpoint, and the difference to one method.
+
+    Args:
+        methods: a task's results.
+        measure: what the task is measured by.
+        reference: the method that the others are compared with; None: no such column.
+    """
+    rows: list[Row] = [("", "training seeds", "gradient steps", f"{LABELS[measure]}, last", "by seed")]
+    if reference is not None:
+        rows[0] += (f"minus `{reference}`",)
+    for name, runs in methods.items():
+        trained = runs[0].steps is not None
+        by_seed = [f"{pooled([result], 'last', measure).mean:.2f}" for result in runs]
+        cells = [
+            name,
+            str(len(runs)) if trained else "-",
+            str(runs[0].steps) if trained else "-",
+            str(pooled(runs, "last", measure)),
+            " / ".join(by_seed) if len(runs) > 1 else "-",
+        ]
+        if reference is not None:
+            cells.append(
+                "" if name == reference else difference_cell(runs, methods[reference], "last", measure)
+            )
+        rows.append(tuple(cells))
+    return rows
+
+
 def results_table(methods: Methods, measure: str, n_seeds: int) -> list[Row]:
-    """What the methods achieved: the task's measure first, then the other one if it adds anything.
+    """Everything that the methods achieved: the task's measure first, then the other one if it adds anything.
 
     Args:
         methods: a task's results.
