@@ -4,7 +4,7 @@
 UV := $(shell uv --version >/dev/null 2>&1 && echo uv || echo .uv/bin/uv)
 RUN := $(UV) run --frozen --all-extras
 
-.PHONY: help setup quickstart test test-fast lint .mypy
+.PHONY: help setup quickstart test test-fast lint docs .mypy
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -16,7 +16,7 @@ help:  ## this list
 setup: $(filter .uv/bin/uv,$(UV))  ## install the package with all extras into .venv (needs Python 3.12)
 	@$(UV) sync --frozen --all-extras --compile-bytecode
 
-quickstart: setup  ## distill a teacher on FetchPickAndPlace, offline, in 15 to 30 minutes
+quickstart: setup  ## distill a teacher that lifts any of three cubes, offline, and watch it
 	@PATH="$(CURDIR)/.venv/bin:$$PATH" bash examples/quickstart.sh
 
 test: setup  ## all tests, fast ones first
@@ -28,6 +28,9 @@ test-fast: setup  ## tests without the end-to-end runs
 
 lint: setup .mypy  ## ruff and mypy
 	@$(RUN) ruff check . && $(RUN) ruff format --check . && $(RUN) mypy
+
+docs: setup  ## the documentation's site, strictly, into site/
+	@NO_MKDOCS_2_WARNING=1 $(RUN) --group docs mkdocs build --strict --quiet
 
 .mypy: setup  # LeRobot's sources, which mypy does not follow in site-packages: they have no py.typed marker
 	@mkdir -p .mypy && ln -sfn $$($(RUN) python -c 'import importlib.util as u; print(u.find_spec("lerobot").submodule_search_locations[0])') .mypy/lerobot

@@ -28,26 +28,13 @@ BENCHMARKS = ROOT / "benchmarks"
 COMPARISON = BENCHMARKS / "comparison"
 PAGES = ROOT / "docs" / "results"
 README = ROOT / "README.md"
+OVERVIEW = PAGES / "index.md"
 WHEN = ROOT / "docs" / "when_guidance_helps.md"
-SUMMARY = {
-    "bc": "cloning",
-    "pd": "PD",
-    "dagger": "DAgger",
-    "agpd": "AGPD",
-    "pd_long": "PD, 3x steps",
-    "agpd_long": "AGPD, 3x steps",
-    "teacher": "teacher",
-}
-"""Methods of the README's table of tasks with one way, and their names there."""
-WAYS_SUMMARY = {
-    "bc": "cloning",
-    "pd": "PD",
-    "dagger": "DAgger",
-    "nearest_4": "nearest of 4",
-    "agpd": "AGPD",
-    "teacher": "teacher",
-}
-"""The same of tasks with several ways."""
+SUMMARY = {"bc": "cloning", "pd": "PD", "agpd": "AGPD", "teacher": "teacher"}
+"""Methods of the overview, and their names there; the pages behind its links have all of them."""
+
+PUBLISHED, SAMPLERS = "DP-C, published", {"100 DDPM": "100 steps", "10 DDIM": "10 steps"}
+"""Rows of the latency benchmark that the README's table shows, and what it calls their samplers."""
 
 Results = dict[str, dict[str, list[RunResult]]]
 """Task and method to results, one per training seed."""
@@ -155,10 +142,9 @@ def comparison_page(path: Path, matrix: Matrix, results: Results, missing: list[
     return f"{notes}\n\n{comparison_report(matrix, results, missing, pictures)}"
 
 
-def summary(
-    comparisons: dict[Path, tuple[Matrix, Results, list[str]]], names: dict[str, str], several_ways: bool
-) -> str:
+def summary(comparisons: dict[Path, tuple[Matrix, Results, list[str]]], several_ways: bool) -> str:
     """One row per task and one column per method: the task's measure at the last checkpoint."""
+    names = SUMMARY
     rows = [("", *names.values(), "AGPD minus PD")]
     for path, (matrix, results, _) in comparisons.items():
         for task, methods in results.items():
@@ -166,7 +152,7 @@ def summary(
                 continue
             entry = matrix.tasks[task]
             measure = "" if entry.measure == "success" else ", mean max reward"
-            link = f"[{entry.title or task}](docs/results/comparison-{path.stem}.md){measure}"
+            link = f"[{entry.title or task}](comparison-{path.stem}.md){measure}"
             cells = [summary_cell(methods.get(name, []), entry.measure) for name in names]
             pair = (methods.get("agpd", []), methods.get("pd", []))
             rows.append((link, *cells, difference_cell(*pair, "last", entry.measure)))
@@ -181,6 +167,23 @@ def summary_cell(runs: list[RunResult], measure: str) -> str:
     return value if runs[0].steps is None else value + raised(len(runs))
 
 
+def first_table() -> str:
+    """What the README shows first: the quickstart's policies, and the time of published sizes."""
+    rows = [("", "success", "N", "ms per chunk", "parameters")]
+    latency = json.loads((BENCHMARKS / "latency" / "latency-cpu.json").read_text())["entries"]
+    for entry in latency:
+        if entry["name"].startswith(PUBLISHED) and entry["batch_size"] == 1 and entry["sampler"] in SAMPLERS:
+            size = f"{entry['n_parameters'] / 1e6:.1f} M"
+            name = f"published-size teacher, {SAMPLERS[entry['sampler']]}"
+            rows.append((name, "-", "-", f"{entry['median_ms']:.0f}", size))
+    for result in committed.read_report(BENCHMARKS / "quickstart" / "report.json"):
+        final = result.finals["last"]
+        size = f"{result.latency.n_parameters / 1e6:.2f} M"
+        time = f"{result.latency.median_ms:.1f}"
+        rows.append((result.name, str(success_rate(final.successes)), str(len(final.successes)), time, size))
+    return markdown(rows)
+
+
 def filled(page: str, name: str, table: str) -> str:
     """A text whose table between `<!-- name-results -->` and `<!-- end -->` is exchanged."""
     pattern = re.compile(rf"(<!-- {name}-results -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -189,11 +192,9 @@ def filled(page: str, name: str, table: str) -> str:
 
 def render(draw: bool) -> dict[Path, str]:
     """All pages; the pictures of comparisons are drawn beside their results."""
-    pages = {README: README.read_text()}
+    pages = {README: filled(README.read_text(), "first", first_table())}
     for folder in sorted(path.parent for path in BENCHMARKS.glob("*/report.json")):
         pages[PAGES / f"{folder.name}.md"] = report_page(folder)
-        table = markdown(summary_table(committed.read_report(folder / "report.json")))
-        pages[README] = filled(pages[README], folder.name, table)
     for path in sorted((BENCHMARKS / "latency").glob("latency-*.json")):
         pages[PAGES / f"{path.stem}.md"] = latency_page(path)
     for folder in sorted(path.parent for path in (BENCHMARKS / "diversity").glob("*/sweep.json")):
@@ -205,10 +206,10 @@ def render(draw: bool) -> dict[Path, str]:
         if draw:
             write_pictures(matrix, results, matrix.output)
         pages[PAGES / f"comparison-{path.stem}.md"] = comparison_page(path, matrix, results, missing)
-    several = summary(comparisons, WAYS_SUMMARY, several_ways=True)
-    pages[README] = filled(pages[README], "comparison", summary(comparisons, SUMMARY, several_ways=False))
-    pages[README] = filled(pages[README], "ways", several)
-    pages[WHEN] = filled(WHEN.read_text(), "ways", several.replace("(docs/", "("))
+    several = summary(comparisons, several_ways=True)
+    overview = filled(OVERVIEW.read_text(), "comparison", summary(comparisons, several_ways=False))
+    pages[OVERVIEW] = filled(overview, "ways", several)
+    pages[WHEN] = filled(WHEN.read_text(), "ways", several.replace("(comparison", "(results/comparison"))
     return pages
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 from dataclasses import asdict, dataclass
 from functools import partial
+from pathlib import Path
 
 from accelerate import PartialState
+from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.envs import EnvConfig
 
@@ -16,6 +18,7 @@ from lerobot_agpd.guidance.strength import STEPS_FLAG, first_strength, require_s
 from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.loading import check_fit, collection_environment, load_teacher
 from lerobot_agpd.progress import REPLAY_FOLDER, Progress, find_replay_root
+from lerobot_agpd.replay.chunk_store import FOLDER, ChunkStore
 from lerobot_agpd.replay.demonstrations import DemonstrationFrames
 from lerobot_agpd.replay.export import check_observation
 from lerobot_agpd.replay.journal import EpisodeJournal
@@ -99,11 +102,12 @@ def build_parts(
     env_config = collection_environment(config.collect, run) if config.collect.enabled else None
     check_fit(config, teacher, meta, env_config)
     collector, journal = None, None
+    root = _root(config, run, progress)
     if env_config is not None:
         _check_steps(student, teacher, demonstrations)
         _check_strength(config, teacher, self_teacher, meta.stats or {})
         _warn_of_settings(config)
-        journal = _journal(config, run, progress, meta, env_config, seed)
+        journal = _journal(config, root, progress, meta, env_config, seed)
         check = partial(check_observation, meta.features)
         rank, n_ranks = processes.process_index, processes.num_processes
         collector = Collector(config, env_config, meta, journal, check, seed, rank, n_ranks)
@@ -113,7 +117,7 @@ def build_parts(
         replay=replay,
         teacher=teacher,
         self_teacher=self_teacher,
-        teacher_chunks=_teacher_chunks(config, teacher, replay, seed),
+        teacher_chunks=_teacher_chunks(config, teacher, replay, seed, root),
         collector=collector,
         journal=journal,
         reports=_adopt_rounds(journal, replay, progress),
@@ -183,7 +187,7 @@ def _self_teacher(student: Student, progress: Progress) -> SelfTeacher | None:
 
 
 def _teacher_chunks(
-    config: StudentConfig, teacher: Teacher | None, replay: Replay, seed: int
+    config: StudentConfig, teacher: Teacher | None, replay: Replay, seed: int, root: Path | None
 ) -> TeacherChunks | None:
     if teacher is None or not config.needs_teacher_chunks:
         return None
@@ -194,22 +198,46 @@ def _teacher_chunks(
         f"current one on, the student's chunk has {config.future_steps}, and its loss counts the recorded steps behind "
         "the teacher's; pass --policy.do_mask_loss_for_padding=true, which leaves them out",
     )
-    return TeacherChunks(teacher, replay, config.future_steps, seed)
+    store = None
+    if root is not None:
+        identity = _chunks_identity(config, replay, seed)
+        store = ChunkStore(root.with_name(FOLDER), identity, writes=PartialState().is_main_process)
+    return TeacherChunks(teacher, replay, config.future_steps, seed, store)
+
+
+def _chunks_identity(config: StudentConfig, replay: Replay, seed: int) -> dict[str, object]:
+    """What decides the teacher's chunks on the demonstrations and on the run's episodes."""
+    dataset = replay.demonstrations.dataset.meta
+    weights = Path(config.teacher.path) / SAFETENSORS_SINGLE_FILE
+    return {
+        **asdict(config.teacher),
+        "weights": [weights.stat().st_size, weights.stat().st_mtime_ns] if weights.is_file() else None,
+        "demonstrations": [dataset.repo_id, str(dataset.root), dataset.total_frames],
+        "seed": seed,
+    }
 
 
 # ---- collection ----
 
 
+def _root(config: StudentConfig, run: RunInfo, progress: Progress) -> Path | None:
+    """Folder of the collected episodes; None if nothing of the run is kept on disk but its checkpoints."""
+    named = config.replay.root or run.output_dir or progress.checkpoint
+    if config.collect.enabled or (named and config.needs_teacher_chunks):
+        return find_replay_root(config, run, progress)
+    return None
+
+
 def _journal(
     config: StudentConfig,
-    run: RunInfo,
+    root: Path | None,
     progress: Progress,
     demonstrations: LeRobotDatasetMetadata,
     env_config: EnvConfig,
     seed: int,
 ) -> EpisodeJournal:
     """The journal of the run's episodes; notes its folder in `progress`."""
-    root = find_replay_root(config, run, progress)
+    assert root is not None
     progress.replay_root = str(root)
     identity = _identity(config, env_config, seed)
     journal = EpisodeJournal(root)

@@ -1,9 +1,9 @@
-"""Where a round's time goes."""
+"""Where a round's time goes, and how long a call takes."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -26,3 +26,16 @@ class Stopwatch:
             if torch.accelerator.is_available():
                 torch.accelerator.synchronize()
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+def call_times(call: Callable[[], object], repeats: int, warmup: int = 3) -> list[float]:
+    """Milliseconds of each of `repeats` calls, after `warmup` calls that are not timed."""
+    times = []
+    for repeat in range(repeats + warmup):
+        start = time.perf_counter()
+        call()
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+        if repeat >= warmup:
+            times.append(1e3 * (time.perf_counter() - start))
+    return times

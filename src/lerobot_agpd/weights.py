@@ -63,6 +63,12 @@ def not_finite_weight(model: nn.Module) -> str | None:
     return None
 
 
+def acting_parameters(policy: nn.Module) -> int:
+    """Count the parameters of the acting network; a student's discriminator and representation only train."""
+    network = getattr(policy, "model", None) or getattr(policy, "diffusion", None) or policy
+    return sum(parameter.numel() for parameter in network.parameters())
+
+
 def is_main_process() -> bool:
     """Whether this process writes the files of a run; later versions of LeRobot save on every process."""
     from accelerate import PartialState

@@ -7,12 +7,15 @@ from contextlib import closing
 
 import pytest
 import torch
+from huggingface_hub import ModelCard
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import PushtEnv
 from lerobot.policies import make_pre_post_processors
 
+from lerobot_agpd.cards.model_card import ModelFacts, model_card
 from lerobot_agpd.cli import report as command
 from lerobot_agpd.config import FlagError
+from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
 from lerobot_agpd.policies.agpd_diffusion.modeling_agpd_diffusion import AGPDDiffusionPolicy
 from lerobot_agpd.studies.evaluation import Evaluator
@@ -45,6 +48,7 @@ def test_one_row_per_policy_and_number_of_executed_steps(monkeypatch, tmp_path, 
     assert own["final"] == plain["student"]["final"]
     assert every["final"]["seeds"] == [100_000, 100_001, 100_002]
     assert {path.name for path in (tmp_path / "several").iterdir()} == {
+        "report.html",
         "report.json",
         "report.md",
         "curves.png",
@@ -152,3 +156,13 @@ def test_a_run_is_reported_with_its_curve(monkeypatch, tmp_path, student):
     curve = rows["run"]["curve"]
     assert list(curve) == ["5", "10"] and curve["10"] == rows["run"]["final"]
     assert curve["5"]["seeds"] == [100_000, 100_001]
+
+
+def test_the_success_rate_enters_the_model_card(monkeypatch, tmp_path, student):
+    model_card(AGPDConfig(push_to_hub=False), ModelFacts("A student.", {}, "local/demos")).save(
+        student / "README.md"
+    )
+    rows = reported(monkeypatch, tmp_path / "out", f"--policies={{student: {student}}}")
+    card = ModelCard.load(student / "README.md")
+    assert card.data.eval_results[0].metric_value == rows["student"]["success"]["mean"]
+    assert "3 episodes, seeds from 100000" in card.text

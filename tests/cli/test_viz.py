@@ -3,12 +3,15 @@
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from gymnasium.vector import VectorEnv
 from lerobot.envs.configs import PushtEnv
 from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
+from PIL import Image
 
 from lerobot_agpd.cli import viz
 from lerobot_agpd.config import FlagError, TeacherConfig
@@ -16,6 +19,7 @@ from lerobot_agpd.files import write_json
 from lerobot_agpd.loading import load_student
 from lerobot_agpd.progress import Progress
 from lerobot_agpd.rollout.report import RoundReport
+from lerobot_agpd.studies.recording import plane_to_frame
 
 pytest.importorskip("gym_pusht")
 RrdReader = pytest.importorskip("rerun.experimental").RrdReader
@@ -42,8 +46,10 @@ def rollouts(config: viz.VizConfig, scale: float) -> list:
 
 def test_command_writes_recording_and_picture(monkeypatch, student, tmp_path):
     output, png = tmp_path / "new/a.rrd", tmp_path / "other/a.png"
-    call(monkeypatch, f"--policy.path={student}", "--episodes=2", f"--output={output}", f"--png={png}")
-    assert png.read_bytes().startswith(b"\x89PNG")
+    film = tmp_path / "film.gif"
+    flags = [f"--output={output}", f"--png={png}", f"--animation={film}", "--panel_width=96"]
+    call(monkeypatch, f"--policy.path={student}", "--episodes=2", *flags)
+    assert png.read_bytes().startswith(b"\x89PNG") and film.read_bytes().startswith(b"GIF")
     entities = {chunk.entity_path for chunk in RrdReader(output).store().stream()}
     for episode in range(2):
         root = f"/episode_{episode}"
@@ -55,6 +61,40 @@ def test_command_writes_recording_and_picture(monkeypatch, student, tmp_path):
         for name in ("teacher", "guided", "student"):
             wanted |= {f"{root}/frame/{name}", f"{root}/chunk/0/{name}", f"{root}/chunk/1/{name}"}
         assert wanted <= entities
+
+
+def test_policies_side_by_side(monkeypatch, student, teacher, tmp_path):
+    """Without a guided teacher: no recording, both from the same start."""
+    film = tmp_path / "film.gif"
+    call(
+        monkeypatch,
+        f"--policies={{teacher: {teacher}, student: {student}}}",
+        f"--animation={film}",
+        "--panel_width=96",
+        "--stride=5",
+    )
+    with Image.open(film) as opened:
+        first = np.asarray(opened.convert("RGB"))
+        assert first.shape[1] == 2 * 96 and opened.n_frames > 1
+    panels = [first[-96:, :96], first[-96:, 96:]]
+    gray = [np.abs(panel.astype(int) - (119, 136, 153)).max(axis=-1) < 30 for panel in panels]  # the block
+    assert gray[0].any() and (gray[0] == gray[1]).mean() > 0.97
+
+
+def test_only_positions_are_drawn_on_the_frame():
+    agent = gym.spaces.Box(0, 512, (2,))
+    for space, observed, drawn in (
+        (gym.spaces.Box(0, 512, (2,)), {"agent_pos": agent}, True),
+        (gym.spaces.Box(-1, 1, (2,)), {"agent_pos": agent}, False),  # a force
+        (gym.spaces.Box(0, 512, (2,)), {"pixels": agent}, False),
+        (gym.spaces.Box(0, 512, (3,)), {"agent_pos": agent}, False),
+    ):
+        env = VectorEnv()
+        env.single_action_space, env.single_observation_space = space, gym.spaces.Dict(observed)
+        to_frame = plane_to_frame(env, np.zeros((256, 128, 3)))
+        assert (to_frame is not None) == drawn
+        if to_frame is not None:
+            np.testing.assert_array_equal(to_frame(np.array([[512.0, 256.0]])), [[128.0, 128.0]])
 
 
 def test_decisions_and_frames_belong_to_the_steps(monkeypatch, student):
@@ -144,6 +184,13 @@ def test_failing_renderer_names_the_remedies(monkeypatch, student):
 def test_wrong_options_are_refused(monkeypatch, student, teacher):
     with pytest.raises(FlagError, match="--episodes"):
         make_config(monkeypatch, student, episodes=0)
+    for options, flag in (
+        ({"policies": {"teacher": teacher}}, "--animation"),
+        ({"animation": Path("a.gif"), "render": False}, "--render=false"),
+        ({"animation": Path("a.gif"), "stride": 0}, "--stride"),
+    ):
+        with pytest.raises(FlagError, match=flag):
+            make_config(monkeypatch, student, **options)
     with pytest.raises(FlagError, match="--strength"):
         make_config(monkeypatch, student, strength=-1.0)
     with pytest.raises(FlagError, match="has no teacher"):

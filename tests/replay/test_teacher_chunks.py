@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from lerobot_agpd.replay.chunk_store import ChunkStore
 from lerobot_agpd.replay.demonstrations import DemonstrationFrames
 from lerobot_agpd.replay.replay import Replay
 from lerobot_agpd.replay.teacher_chunks import TeacherChunks
@@ -82,3 +83,47 @@ def test_every_frame_is_sampled_once(chunks, stored):
     raw(chunks, list(range(5)) + list(range(6, 18)), {0, 2})
     assert len(chunks.teacher.sampled) == 17
     assert torch.equal(raw(chunks, [1])[0], before), "growth keeps what is there"
+
+
+class TestStore:
+    """Chunks on disk are used again, by a process that would sample the same."""
+
+    @pytest.fixture
+    def make(self, replay, tmp_path):
+        def make(writes=True, **identity):
+            store = ChunkStore(tmp_path, identity, writes)
+            return TeacherChunks(Teacher(), replay, n_chunk_steps=4, seed=7, store=store)
+
+        return make
+
+    def test_the_teacher_is_asked_once(self, make):
+        first, second = make(), make()
+        found, _ = raw(first, [0, 6], {0, 2})
+        assert torch.equal(raw(second, [0, 6], {0, 2})[0], found)
+        assert first.teacher.sampled and not second.teacher.sampled
+
+    def test_another_teacher_is_asked_anew(self, make):
+        first, second = make(path="a"), make(path="b")
+        raw(first, [0], {0})
+        raw(second, [0], {0})
+        assert second.teacher.sampled == first.teacher.sampled != []
+
+    def test_a_damaged_or_unfitting_file_is_replaced(self, make):
+        first = make()
+        found, _ = raw(first, [0], {0})
+        (path,) = first.store.folder.glob("*.npy")
+        whole = path.read_bytes()
+        for content in (b"", whole[: len(whole) // 2]):
+            path.write_bytes(content)
+            again = make()
+            assert torch.equal(raw(again, [0], {0})[0], found) and again.teacher.sampled
+            assert path.read_bytes() == whole
+
+    def test_other_processes_read_only(self, make):
+        other = make(writes=False)
+        raw(other, [0], {0})
+        assert not other.store.folder.exists()
+        raw(make(), [0], {0})
+        reader = make(writes=False)
+        raw(reader, [0], {0})
+        assert not reader.teacher.sampled

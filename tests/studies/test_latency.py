@@ -4,7 +4,8 @@ import torch
 
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
 from lerobot_agpd.policies.agpd_diffusion.modeling_agpd_diffusion import AGPDDiffusionPolicy
-from lerobot_agpd.studies.latency import acting_parameters, chunk_latency, random_observations
+from lerobot_agpd.studies.latency import chunk_latency, random_observations
+from lerobot_agpd.weights import acting_parameters
 
 
 def test_only_the_acting_network_is_counted(agpd_config, agpd_diffusion_config):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from lerobot_agpd.cli.command import entry_point
 from lerobot_agpd.config import FlagError, require
-from lerobot_agpd.replay.export import merge
+from lerobot_agpd.replay.export import merge, upload
 
 logger = logging.getLogger(__name__)
 
@@ -35,7 +35,7 @@ def main(config: MergeConfig) -> None:
         raise FlagError(f"--root={config.root} holds no kept episode")
     logger.info("%d episodes, %d frames in %s", merged.num_episodes, merged.num_frames, merged.root)
     if config.push_to_hub:
-        merged.push_to_hub()
+        upload(merged, config.root)
         logger.info("uploaded to %s", config.repo_id)
 
 

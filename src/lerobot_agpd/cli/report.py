@@ -1,4 +1,4 @@
-"""`lerobot-agpd-report`: evaluate runs side by side; a table, a picture and JSON."""
+"""`lerobot-agpd-report`: evaluate runs side by side; a table, a picture, JSON and a page to look at."""
 
 import logging
 from collections.abc import Sequence
@@ -10,15 +10,26 @@ import draccus
 from lerobot.envs import EnvConfig
 from rich.console import Console
 
+from lerobot_agpd.cards.model_card import add_results, environment_flags
 from lerobot_agpd.cli.command import entry_point
 from lerobot_agpd.config import EVALUATION_SEEDS, require
 from lerobot_agpd.progress import REPLAY_FOLDER
+from lerobot_agpd.replay.journal import EpisodeJournal
 from lerobot_agpd.rollout.report import read_reports
+from lerobot_agpd.studies.contact_sheet import draw_contact_sheet
 from lerobot_agpd.studies.curves import draw_report_curves
 from lerobot_agpd.studies.evaluation import Evaluator, checkpoint_config, checkpoint_steps
+from lerobot_agpd.studies.page import RunPart, write_page
 from lerobot_agpd.studies.report import write_summary
-from lerobot_agpd.studies.results import Result
-from lerobot_agpd.studies.tables import console_table, summary_table
+from lerobot_agpd.studies.results import Result, pooled
+from lerobot_agpd.studies.tables import (
+    console_table,
+    markdown,
+    round_ways_table,
+    rounds_table,
+    summary_table,
+)
+from lerobot_agpd.studies.ways import ways_of_rounds
 
 logger = logging.getLogger(__name__)
 
@@ -29,7 +40,7 @@ class ReportConfig:
 
     # Environment to evaluate in.
     env: EnvConfig
-    # Folder of report.json, report.md, curves.png and the single evaluations, which a second call reuses.
+    # Folder of report.html, report.json, report.md, curves.png and the single evaluations, which a second call reuses.
     output: Path
     # Name to output folder of a lerobot-train run.
     runs: dict[str, Path] = field(default_factory=dict)
@@ -47,15 +58,24 @@ class ReportConfig:
     seed: int = EVALUATION_SEEDS[0]
     # Where policies run.
     device: str = "cpu"
-    # Title of the picture.
+    # Title of picture and page.
     title: str = ""
+    # Further pictures or films to show on the page.
+    pictures: list[Path] = field(default_factory=list)
+    # Episodes of every run's last round to show on a contact sheet, which renders them again; 0: no sheet.
+    sheet_episodes: int = 0
 
     def __post_init__(self) -> None:
         require(
             bool(self.runs or self.policies),
             "nothing to report: name runs (--runs='{name: folder}') or --policies",
         )
-        for name, path in {**self.runs, **self.policies}.items():
+        named = [
+            *self.runs.items(),
+            *self.policies.items(),
+            *(("--pictures", path) for path in self.pictures),
+        ]
+        for name, path in named:
             if not Path(path).exists():
                 raise FileNotFoundError(f"'{name}': {path} does not exist")
         require(self.episodes >= 2, f"--episodes must be at least 2, got {self.episodes}")
@@ -101,7 +121,68 @@ def report_policy(name: str, path: Path, evaluator: Evaluator, config: ReportCon
         row = name if n_steps is None else f"{name}, {n_steps} step{'s' * (n_steps != 1)} per chunk"
         final = evaluator.evaluate(path, config.episodes, config.seed, n_steps)
         results.append(Result(name=row, finals={"last": final}, latency=evaluator.latency(path)))
+    _note_in_card(path, results, config)
     return results
+
+
+def _note_in_card(path: Path, results: Sequence[Result], config: ReportConfig) -> None:
+    """Write what a checkpoint achieved into its model card, if it has one."""
+    success = pooled(results[:1], "last", "success")
+    environment = (
+        f"`{config.env.type}`, task `{config.env.task}`, {success.n} episodes, seeds from {config.seed}"
+    )
+    text = f"In {environment}; intervals are 95 % over episodes:\n\n{markdown(summary_table(results))}"
+    add_results(Path(path), text, draccus.encode(config.env, EnvConfig), success.mean, success.n)
+
+
+# ---- the page ----
+
+
+def run_part(name: str, run: Path, result: Result, config: ReportConfig) -> RunPart:
+    """What the page says of a run; draws the contact sheet of its last round if one is wanted."""
+    journal, pictures = EpisodeJournal(run / REPLAY_FOLDER), {}
+    if config.sheet_episodes and result.rounds:
+        number = len(result.rounds) - 1
+        sheet = config.output / f"sheet-{number}-{run.name}.png"
+        draw_contact_sheet(journal, number, config.env, config.sheet_episodes, sheet)
+        pictures[f"Round {number}: where kept episodes ended, and where dropped ones began"] = sheet
+    checkpoint, flags = last_checkpoint(run), environment_flags(config.env)
+    commands: dict[str, list[str]] = {
+        "Evaluate": ["lerobot-eval", f"--policy.path={checkpoint}", *flags],
+        "Watch": [
+            "lerobot-agpd-viz",
+            f"--policies={{{name}: {checkpoint}}}",
+            *flags,
+            "--animation=rollout.gif",
+        ],
+        "Export": ["lerobot-agpd-export", f"--checkpoint={checkpoint}", "--output=exported"],
+    }
+    ways = ways_of_rounds(journal.root, config.env) if result.rounds else []
+    return RunPart(
+        name=name,
+        rounds=rounds_table(result.rounds) if result.rounds else [],
+        ways=round_ways_table(ways),
+        pictures=pictures,
+        commands=commands,
+    )
+
+
+def write_report_page(results: Sequence[Result], config: ReportConfig) -> None:
+    """Write report.html."""
+    by_name = {result.name: result for result in results}
+    first = {
+        name: next(r for key, r in by_name.items() if key.split(", ")[0] == name) for name in config.runs
+    }
+    pictures = {"Learning curves and collection rounds": config.output / "curves.png"}
+    pictures |= {path.stem: path for path in config.pictures}
+    write_page(
+        config.output / "report.html",
+        config.title,
+        f"{config.env.type}, task {config.env.task}; {config.episodes} episodes, seeds from {config.seed}",
+        summary_table(results),
+        pictures,
+        [run_part(name, run, first[name], config) for name, run in config.runs.items()],
+    )
 
 
 @entry_point("lerobot-agpd-report")
@@ -117,8 +198,9 @@ def main(config: ReportConfig) -> None:
                 results += evaluate(name, path, evaluator, config)
                 write_summary(results, environment, config.seed, config.output)
     draw_report_curves(results, config.title, config.output / "curves.png")
+    write_report_page(results, config)
     Console().print(console_table(summary_table(results)))
-    logger.info("wrote report.json, report.md and curves.png to %s", config.output)
+    logger.info("wrote report.html, report.json, report.md and curves.png to %s", config.output)
 
 
 if __name__ == "__main__":

@@ -1,16 +1,16 @@
-"""`lerobot-agpd-viz`: watch a teacher being guided toward a student, as a rerun recording."""
+"""`lerobot-agpd-viz`: watch a teacher being guided toward a student, or policies side by side."""
 
 import logging
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import rerun as rr
 import torch
+from lerobot.configs import parser
 from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
 from rich.console import Console
 from rich.table import Table
@@ -22,11 +22,20 @@ from lerobot_agpd.guidance.strength import first_strength, require_strength
 from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.loading import load_pair
 from lerobot_agpd.progress import REPLAY_FOLDER, Progress
-from lerobot_agpd.replay.episode import Array, EpisodeSpec
+from lerobot_agpd.replay.episode import EpisodeSpec
 from lerobot_agpd.rollout.report import read_reports
 from lerobot_agpd.rollout.rollout import Rollouts
-from lerobot_agpd.studies.recording import DecisionRecorder, FrameRecorder, RolloutRecord
+from lerobot_agpd.studies.animation import Clip, Line, Style, require_animation, write_animation
+from lerobot_agpd.studies.recording import (
+    COLORS,
+    DecisionRecorder,
+    FrameRecorder,
+    RolloutRecord,
+    action_names,
+    plane_to_frame,
+)
 from lerobot_agpd.studies.rerun_log import blueprint, layout, log_rollout
+from lerobot_agpd.studies.solo import side_by_side
 from lerobot_agpd.studies.still import draw_still
 
 logger = logging.getLogger(__name__)
@@ -49,6 +58,16 @@ class VizConfig(StudentFlags):
     output: Path = Path("outputs/rollout.rrd")
     # Still picture of the first episode to draw.
     png: Path | None = None
+    # Animation to write, .gif or .mp4: of --policies side by side if there are any, else of the guided rollouts.
+    animation: Path | None = None
+    # Name to checkpoint of policies that act alone, from the same starts; no recording is made of them.
+    policies: dict[str, Path] = field(default_factory=dict)
+    # Width of a panel of the animation, pixels.
+    panel_width: int = 240
+    # Show every how many-th step in the animation.
+    stride: int = 1
+    # Where the policies of --policies run.
+    device: str = "cpu"
     # Record rendered frames.
     render: bool = True
     # Show the finished recording in a rerun viewer.
@@ -60,12 +79,38 @@ class VizConfig(StudentFlags):
         Raises:
             ValueError: if there is no checkpoint, or a number is out of range.
         """
+        self._check_animation()
+        if not self.records:
+            return
         super().__post_init__()
-        require(self.episodes >= 1, f"--episodes must be at least 1, got {self.episodes}")
         require(
             self.strength is None or self.strength >= 0,
             f"--strength must not be negative, got {self.strength}",
         )
+
+    @property
+    def records(self) -> bool:
+        """Whether a guided teacher is recorded; with --policies alone there is none."""
+        return not self.policies or parser.get_path_arg("policy") is not None
+
+    def _check_animation(self) -> None:
+        require(self.episodes >= 1, f"--episodes must be at least 1, got {self.episodes}")
+        require_animation(self.animation)
+        require(
+            not self.policies or self.animation is not None,
+            "--policies are shown in an animation: name it with --animation=<file>.gif or .mp4",
+        )
+        require(
+            self.render or self.animation is None,
+            "--animation needs rendered frames, without --render=false",
+        )
+        for name in ("stride", "panel_width"):
+            require(getattr(self, name) >= 1, f"--{name} must be at least 1, got {getattr(self, name)}")
+
+    @property
+    def style(self) -> Style:
+        """How the animation looks: in the environment's own time."""
+        return Style(self.panel_width, self.stride, fps=min(30.0, self.env.fps / self.stride))
 
 
 # ---- student and teacher ----
@@ -115,31 +160,38 @@ def record_rollouts(config: VizConfig, guided: GuidedStrategy, strength: float) 
     try:
         for episode in Rollouts(frames or env, processors, guided, recorder).run(specs):
             pictures = frames.frames if frames is not None else []
-            to_frame = plane_to_frame(env.single_action_space, pictures[0] if pictures else None)
-            yield RolloutRecord(episode, recorder.decisions, pictures, to_frame)
+            to_frame = plane_to_frame(env, pictures[0] if pictures else None)
+            yield RolloutRecord(episode, recorder.decisions, pictures, to_frame, action_names(env))
             recorder.decisions = []
     finally:
         close_envs(tasks)
 
 
-def plane_to_frame(space: gym.Space, frame: Array | None) -> Callable[[Array], Array] | None:
-    """How to draw two-dimensional actions: their bounds span the frame. None for other action spaces.
-
-    Without a frame they are drawn in their own units.
-    """
-    if not (isinstance(space, gym.spaces.Box) and space.shape == (2,) and space.is_bounded()):
-        return None
-    if frame is None:
-        return lambda actions: actions
-    size = np.array([frame.shape[1], frame.shape[0]])
-    return lambda actions: (actions - space.low) / (space.high - space.low) * size
-
-
 # ---- the command ----
 
 
+def clip_of(rollout: RolloutRecord) -> Clip:
+    """A guided rollout as an animation shows it: the three chunks of the running decision, where they can be drawn."""
+    lines: dict[int, list[Line]] = {}
+    if rollout.to_frame is not None:
+        for decision in rollout.decisions:
+            drawn = [Line(rollout.to_frame(chunk), COLORS[name]) for name, chunk in decision.chunks.items()]
+            n_steps = len(decision.chunks["guided"])
+            lines |= dict.fromkeys(range(decision.step, decision.step + n_steps), drawn)
+    return Clip(rollout.frames, rollout.episode.is_success, lines)
+
+
+def animate_policies(config: VizConfig) -> None:
+    """Write `--animation` of the policies that act alone."""
+    assert config.animation is not None
+    seeds = [config.seed + number for number in range(config.episodes)]
+    write_animation(
+        side_by_side(config.env, config.policies, seeds, config.device), config.animation, config.style
+    )
+
+
 def visualize(config: VizConfig) -> Table:
-    """Record the rollouts, and draw the still if one is wanted.
+    """Record the rollouts, and draw the still and the animation if they are wanted.
 
     Returns:
         A summary with one row per episode.
@@ -151,7 +203,7 @@ def visualize(config: VizConfig) -> Table:
     require_strength(guided.pair.teacher, strength, guidance, "--teacher.num_inference_steps")
     title = f"{guidance.unit} {strength:g}"
     table = Table("seed", "steps", "max reward", "success", "J alone", "J guided", title=title)
-    layouts = []
+    layouts, clips = [], []
     config.output.parent.mkdir(parents=True, exist_ok=True)
     with rr.RecordingStream(APPLICATION) as stream:
         stream.save(config.output)
@@ -164,6 +216,10 @@ def visualize(config: VizConfig) -> Table:
             if config.png is not None and number == 0:
                 config.png.parent.mkdir(parents=True, exist_ok=True)
                 draw_still(rollout, config.png)
+            if config.animation is not None and not config.policies:
+                clips.append(clip_of(rollout))
+    if clips and config.animation is not None:
+        write_animation({"guided teacher": clips}, config.animation, config.style)
     return table
 
 
@@ -179,11 +235,15 @@ def _row(rollout: RolloutRecord) -> tuple[str, ...]:
 @entry_point("lerobot-agpd-viz")
 def main(config: VizConfig) -> None:
     """Record and report."""
-    Console().print(visualize(config))
-    logger.info("recording in %s (open it with `rerun %s`)", config.output, config.output)
-    if config.png is not None:
-        logger.info("still picture in %s", config.png)
-    if config.open:  # in a process of its own, which outlives this one
+    if config.records:
+        Console().print(visualize(config))
+        logger.info("recording in %s (open it with `rerun %s`)", config.output, config.output)
+    if config.policies:
+        animate_policies(config)
+    for kind, path in (("still picture", config.png), ("animation", config.animation)):
+        if path is not None and path.is_file():
+            logger.info("%s in %s (%d kB)", kind, path, path.stat().st_size // 1000)
+    if config.open and config.records:  # in a process of its own, which outlives this one
         command = [sys.executable, "-m", "rerun", str(config.output)]
         subprocess.Popen(command, start_new_session=True)  # noqa: S603  # no shell, this interpreter
 

@@ -17,19 +17,21 @@ from torch import Tensor, nn
 from lerobot_agpd.adversary import Discriminator
 from lerobot_agpd.agpd import AGPD
 from lerobot_agpd.build import build_parts
-from lerobot_agpd.config import StudentConfig, require
+from lerobot_agpd.cards.distillation import distillation_facts
+from lerobot_agpd.cards.model_card import ModelFacts
 from lerobot_agpd.continuation import how_to_continue
 from lerobot_agpd.guidance.representation import LR, StateRepresentation
 from lerobot_agpd.interrupts import InterruptMessage
+from lerobot_agpd.policies.carded import CardedPolicy
 from lerobot_agpd.policies.fused_groups import ParameterGroup, fused_groups
 from lerobot_agpd.policies.gradient_norms import GradientNorms
 from lerobot_agpd.replay.demonstrations import delivers_single_frames
-from lerobot_agpd.replay.export import merge
+from lerobot_agpd.replay.export import merge, upload
 from lerobot_agpd.replay.normalization import Statistics
 from lerobot_agpd.replay.served_frames import serve_from_memory
 from lerobot_agpd.run import RunInfo
-from lerobot_agpd.student import Student
-from lerobot_agpd.weights import not_finite_weight, require_weights
+from lerobot_agpd.student import Student, vector_dim
+from lerobot_agpd.weights import acting_parameters, not_finite_weight, require_weights
 
 logger = logging.getLogger(__name__)
 
@@ -41,7 +43,7 @@ REMEDY = (
 )
 
 
-class DistilledPolicy(Student):
+class DistilledPolicy(CardedPolicy, Student):
     """Mixin: a policy trained by AGPD in LeRobot's own training loop.
 
     In eval mode it is the policy it is mixed into, and it loads without teacher, dataset or environment. A
@@ -185,15 +187,15 @@ class DistilledPolicy(Student):
         try:
             merged = merge(journal.root, collect.repo_id)
             if merged is not None and collect.push_to_hub:
-                merged.push_to_hub()
+                upload(merged, journal.root)
         except Exception:
-            upload = f" --repo_id={collect.repo_id} --push_to_hub=true" if collect.push_to_hub else ""
+            flags = f" --repo_id={collect.repo_id} --push_to_hub=true" if collect.push_to_hub else ""
             logger.exception(
                 "the collected episodes could not be merged or uploaded; they are complete in %s. Once the cause is "
                 "gone, run lerobot-agpd-merge --root=%s%s",
                 journal.root,
                 journal.root,
-                upload,
+                flags,
             )
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -220,6 +222,13 @@ class DistilledPolicy(Student):
 
     # ---- checkpoints ----
 
+    def model_facts(self) -> ModelFacts | None:
+        """What the model card says of the run; None outside of one."""
+        dataset = self._training_data[0]
+        if self._agpd is None or dataset is None:
+            return None
+        return distillation_facts(self._agpd, acting_parameters(self), dataset)
+
     def _save_pretrained(self, save_directory: Path, **kwargs: Any) -> None:
         super()._save_pretrained(save_directory, **kwargs)  # type: ignore[misc]
         if self._agpd is not None and PartialState().is_main_process:
@@ -229,18 +238,3 @@ class DistilledPolicy(Student):
     def _load_as_safetensor(cls, model: Any, model_file: str, map_location: str, strict: bool) -> Any:
         require_weights(model, model_file, optional=cls.optional_weights)
         return super()._load_as_safetensor(model, model_file, map_location, strict)  # type: ignore[misc]
-
-
-def vector_dim(config: StudentConfig) -> int:
-    """Size D of all low-dimensional observations side by side.
-
-    Raises:
-        FlagError: if there are none.
-    """
-    features = config.input_features or {}
-    require(
-        bool(config.observed_vectors),
-        "--policy.representation.type=state predicts low-dimensional observations, but the inputs are "
-        f"{list(features)}; use --policy.representation.type=action",
-    )
-    return sum(features[key].shape[0] for key in config.observed_vectors)

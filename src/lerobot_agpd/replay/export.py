@@ -15,6 +15,7 @@ from lerobot.utils.constants import DONE, OBS_PREFIX
 from lerobot.utils.utils import is_valid_numpy_dtype_string
 
 from lerobot_agpd.dataset_writer import DatasetWriter
+from lerobot_agpd.replay.card import card_options, write_card
 from lerobot_agpd.replay.episode import Array
 from lerobot_agpd.replay.journal import EpisodeJournal
 from lerobot_agpd.replay.stored import StoredEpisode
@@ -77,7 +78,14 @@ def merge(root: Path, repo_id: str | None = None) -> LeRobotDataset | None:
         merged.rename(replaced)
     fresh.rename(merged)
     shutil.rmtree(replaced, ignore_errors=True)
-    return LeRobotDataset(writer.repo_id, root=merged)
+    dataset = LeRobotDataset(writer.repo_id, root=merged)
+    write_card(dataset, journal)
+    return dataset
+
+
+def upload(dataset: LeRobotDataset, root: Path) -> None:
+    """Push a merged dataset to the Hub, with a card that tells how the journal at `root` came about."""
+    dataset.push_to_hub(**card_options(EpisodeJournal(root)))
 
 
 def _check_replaceable(merged: Path) -> None:

@@ -192,7 +192,7 @@ class EpisodeJournal:
 
     def stored(self) -> Iterator[tuple[int, StoredEpisode]]:
         """All kept episodes with their rounds, those of an unfinished round too."""
-        for round_number in self._rounds():
+        for round_number in self.rounds():
             for episode in self.kept(round_number):
                 yield round_number, episode
 
@@ -206,7 +206,7 @@ class EpisodeJournal:
         Raises:
             ValueError: if a round before the last finished one is not finished, or a report is damaged.
         """
-        finished = [number for number in self._rounds() if self.is_finished(number)]
+        finished = [number for number in self.rounds() if self.is_finished(number)]
         missing = set(range(len(finished))) - set(finished)
         if missing:
             raise ValueError(
@@ -216,7 +216,7 @@ class EpisodeJournal:
         remedy = "restore it, or delete it to have the round finished again if no later round exists"
         return [read_json(self.folder(number) / REPORT, remedy) for number in finished]
 
-    def _rounds(self) -> list[int]:
+    def rounds(self) -> list[int]:
         """Numbers of the rounds that were begun, in order."""
         if not self.root.exists():
             return []

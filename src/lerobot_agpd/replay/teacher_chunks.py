@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import logging
+import sys
 import time
 
 import torch
 from lerobot.utils.constants import ACTION
 from torch import Tensor
+from tqdm import tqdm
 
 from lerobot_agpd.config import StudentConfig
 from lerobot_agpd.guidance.teacher import Teacher
+from lerobot_agpd.replay.chunk_store import ChunkStore
 from lerobot_agpd.replay.demonstrations import Batch
 from lerobot_agpd.replay.gate import FarValues
 from lerobot_agpd.replay.growing import GrowingTensor
@@ -20,20 +23,32 @@ logger = logging.getLogger(__name__)
 
 BATCH_SIZE = 256
 
+BAR_AFTER = 5.0
+"""Seconds after which sampling shows its progress."""
+
 
 class TeacherChunks:
-    """Unguided teacher chunks for the frames of T, sampled once per episode and kept in memory.
+    """Unguided teacher chunks for the frames of T, sampled once per episode and kept in memory, and on disk if wanted.
 
     Args:
         teacher: the teacher.
         replay: T.
         n_chunk_steps: steps S of the student's chunk from the current one on.
         seed: of the sampling noise.
+        store: where sampled chunks are kept on disk; None: nowhere.
     """
 
-    def __init__(self, teacher: Teacher, replay: Replay, n_chunk_steps: int, seed: int):
+    def __init__(
+        self,
+        teacher: Teacher,
+        replay: Replay,
+        n_chunk_steps: int,
+        seed: int,
+        store: ChunkStore | None = None,
+    ):
         self.teacher = teacher
         self.replay = replay
+        self.store = store
         self.n_shared = min(n_chunk_steps, teacher.n_chunk_steps)
         self.n_chunk_steps = n_chunk_steps
         self.seed = seed
@@ -77,28 +92,54 @@ class TeacherChunks:
         return self._chunks.values
 
     def _sample(self, episodes: list[int], chunks: Tensor) -> None:
-        """Sample whole episodes, each with noise of its own: when an episode is sampled does not change its chunks."""
-        began, n_frames = time.perf_counter(), 0
-        ends = self.replay.table.lengths.cumsum(0).tolist()
-        for episode in episodes:
-            start = ends[episode - 1] if episode else 0
-            generator = torch.Generator(device=chunks.device).manual_seed(self.seed + start)
-            for part in torch.arange(start, ends[episode]).split(BATCH_SIZE):
-                chunks[part] = 0.0
-                sampled = self._teacher_chunks(part, generator)
+        """Fill in whole episodes, each with noise of its own: when an episode is sampled does not change its chunks."""
+        began, n_frames, n_stored = time.perf_counter(), 0, 0
+        lengths = self.replay.table.lengths
+        starts = (lengths.cumsum(0) - lengths).tolist()
+        total = int(lengths[episodes].sum())
+        # A terminal is told how far it is if that takes long; a log gets the line at the end.
+        with tqdm(
+            total=total,
+            desc="teacher chunks",
+            unit="frame",
+            delay=BAR_AFTER,
+            leave=False,
+            disable=not sys.stderr.isatty(),
+        ) as bar:
+            for episode in episodes:
+                frames = torch.arange(starts[episode], starts[episode] + int(lengths[episode]))
+                raw, is_stored = self._raw_chunks(episode, frames, chunks)
+                sampled = self.replay.demonstrations.normalizer.normalize(ACTION, raw.to(chunks.device))
                 self._far_values.check("the teacher's chunks", ACTION, sampled)
-                chunks[part, : self.n_shared] = sampled
-            n_frames += ends[episode] - start
+                chunks[frames] = 0.0
+                chunks[frames, : self.n_shared] = sampled
+                n_frames += len(frames)
+                n_stored += is_stored * len(frames)
+                bar.update(len(frames))
         self._sampled.update(episodes)
         seconds = time.perf_counter() - began
         self.seconds += seconds
-        logger.info("teacher chunks at %d recorded frames took %.1f s", n_frames, seconds)
+        logger.info(
+            "teacher chunks at %d recorded frames took %.1f s (%d were on disk)", n_frames, seconds, n_stored
+        )
+
+    def _raw_chunks(self, episode: int, frames: Tensor, chunks: Tensor) -> tuple[Tensor, bool]:
+        """The shared steps (T, n_shared, A) of an episode's chunks in the environment's units; whether disk had them."""
+        stored = (
+            self.store.read(episode, (len(frames), self.n_shared, chunks.shape[-1])) if self.store else None
+        )
+        if stored is not None:
+            return stored, True
+        generator = torch.Generator(device=chunks.device).manual_seed(self.seed + int(frames[0]))
+        raw = torch.cat([self._teacher_chunks(part, generator) for part in frames.split(BATCH_SIZE)])
+        if self.store is not None:
+            self.store.write(episode, raw)
+        return raw, False
 
     def _teacher_chunks(self, frame_index: Tensor, generator: torch.Generator) -> Tensor:
-        """The shared steps (B, n_shared, A) of newly sampled chunks, in the student's normalized space."""
+        """The shared steps (B, n_shared, A) of newly sampled chunks, in the environment's units."""
         history = self.replay.history(
             frame_index, list(self.teacher.input_features), self.teacher.n_obs_steps
         )
         with torch.autocast(generator.device.type, enabled=False):  # as precise as what it executes
-            raw = self.teacher.sample(history, generator=generator)[:, : self.n_shared]
-        return self.replay.demonstrations.normalizer.normalize(ACTION, raw.to(generator.device))
+            return self.teacher.sample(history, generator=generator)[:, : self.n_shared]

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+
+from lerobot_agpd.stopwatch import call_times
+from lerobot_agpd.weights import acting_parameters
 
 
 @dataclass(frozen=True)
@@ -48,19 +49,6 @@ def chunk_latency(
     )
 
 
-def call_times(call: Callable[[], object], repeats: int, warmup: int = 3) -> list[float]:
-    """Milliseconds of each of `repeats` calls, after `warmup` calls that are not timed."""
-    times = []
-    for repeat in range(repeats + warmup):
-        start = time.perf_counter()
-        call()
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
-        if repeat >= warmup:
-            times.append(1e3 * (time.perf_counter() - start))
-    return times
-
-
 def random_observations(policy: PreTrainedPolicy, batch_size: int) -> dict[str, torch.Tensor]:
     """Draw normalized observations for `predict_action_chunk`, with a history for diffusion policies."""
     config = policy.config
@@ -74,9 +62,3 @@ def random_observations(policy: PreTrainedPolicy, batch_size: int) -> dict[str, 
             for key, value in batch.items()
         }
     return batch
-
-
-def acting_parameters(policy: PreTrainedPolicy) -> int:
-    """Count the parameters of the acting network; a student's discriminator and representation only train."""
-    network = getattr(policy, "model", None) or getattr(policy, "diffusion", None) or policy
-    return sum(parameter.numel() for parameter in network.parameters())

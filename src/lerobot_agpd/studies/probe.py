@@ -26,8 +26,8 @@ from lerobot_agpd.guidance.teacher_student import TeacherStudent
 from lerobot_agpd.replay.episode import Array
 from lerobot_agpd.rollout.diagnostics import sample_spread
 from lerobot_agpd.rollout.strategies import NearestStrategy, Strategy, TeacherStrategy, repeat
+from lerobot_agpd.stopwatch import call_times
 from lerobot_agpd.student import StudentSampler, executed_steps
-from lerobot_agpd.studies.latency import call_times
 from lerobot_agpd.studies.probe_states import RecordedStates
 from lerobot_agpd.studies.probe_verdict import (
     GUIDANCE_STRENGTHS,

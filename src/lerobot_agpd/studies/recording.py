@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import VectorEnv, VectorWrapper
@@ -47,12 +48,18 @@ class RolloutRecord:
         decisions: in the order of their steps.
         frames: T rendered frames (H, W, 3) uint8, or none.
         to_frame: maps actions (n, 2) to pixels (n, 2) of the frame; None if actions are no positions in it.
+        action_names: of the action's dimensions; default: their numbers.
     """
 
     episode: Episode
     decisions: Sequence[DecisionRecord]
     frames: Sequence[Array] = ()
     to_frame: Callable[[Array], Array] | None = None
+    action_names: Sequence[str] = ()
+
+    def name_of(self, dim: int) -> str:
+        """Name of an action dimension."""
+        return self.action_names[dim] if self.action_names else f"action {dim}"
 
     def observed(self, ndim: int) -> dict[str, Array]:
         """Observations that are images (T, H, W, C), with 4 dimensions, or vectors (T, D), with 2."""
@@ -112,7 +119,7 @@ class FrameRecorder(VectorWrapper):
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset and render."""
         result = self.env.reset(seed=seed, options=options)
-        self.frames = [self._render()]
+        self.frames = [rendered_frame(self.env)]
         return result
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -120,19 +127,59 @@ class FrameRecorder(VectorWrapper):
         result = self.env.step(actions)
         _, _, terminated, truncated, _ = result
         if not (terminated[0] or truncated[0]):
-            self.frames.append(self._render())
+            self.frames.append(rendered_frame(self.env))
         return result
 
-    def _render(self) -> Array:
-        try:
-            rendered = self.env.render()
-        except Exception as error:
-            raise RuntimeError(
-                f"rendering failed ({error}). MuJoCo environments need an OpenGL backend: set the environment variable "
-                "MUJOCO_GL=egl (GPU or Mesa) or MUJOCO_GL=osmesa (software); or record without frames: --render=false"
-            ) from error
-        if not rendered or not isinstance(rendered[0], np.ndarray):
-            raise RuntimeError(
-                "the environment renders no pictures; pass --env.render_mode=rgb_array or --render=false"
-            )
-        return rendered[0]
+
+def rendered_frame(env: VectorEnv) -> Array:
+    """A frame (H, W, 3) uint8 of the first environment.
+
+    Raises:
+        RuntimeError: if the environment cannot render, with what to do.
+    """
+    try:
+        rendered = env.render()
+    except Exception as error:
+        raise RuntimeError(
+            f"rendering failed ({error}). MuJoCo environments need an OpenGL backend: set the environment variable "
+            "MUJOCO_GL=egl (GPU or Mesa) or MUJOCO_GL=osmesa (software); or record without frames: --render=false"
+        ) from error
+    if not rendered or not isinstance(rendered[0], np.ndarray):
+        raise RuntimeError(
+            "the environment renders no pictures; pass --env.render_mode=rgb_array or --render=false"
+        )
+    return rendered[0]
+
+
+# ---- what an environment says of its actions ----
+
+
+def plane_to_frame(env: VectorEnv, frame: Array | None) -> Callable[[Array], Array] | None:
+    """How to draw actions that are positions in the frame; None if they are none, such as forces or velocities.
+
+    They are positions if an action is where `agent_pos` shall be: two numbers with the same bounds. These bounds span the
+    frame, as in Push-T; without a frame they are drawn in their own units.
+    """
+    space, observed = env.single_action_space, env.single_observation_space
+    position = observed.get("agent_pos") if isinstance(observed, gym.spaces.Dict) else None
+    if not (isinstance(space, gym.spaces.Box) and isinstance(position, gym.spaces.Box)):
+        return None
+    if space.shape != (2,) or position.shape != (2,) or not space.is_bounded():
+        return None
+    if not (np.allclose(space.low, position.low) and np.allclose(space.high, position.high)):
+        return None
+    low, high = space.low, space.high
+    if frame is None:
+        return lambda actions: actions
+    size = np.array([frame.shape[1], frame.shape[0]])
+    return lambda actions: (actions - low) / (high - low) * size
+
+
+def action_names(env: VectorEnv) -> list[str]:
+    """Names of the action's dimensions: `action_names` of the environment, else their numbers."""
+    n_dims = int(np.prod(env.single_action_space.shape or (1,)))
+    try:
+        names = [str(name) for name in env.get_attr("action_names")[0]]  # type: ignore[attr-defined]
+    except AttributeError:
+        names = []
+    return names if len(names) == n_dims else [f"action {dim}" for dim in range(n_dims)]

@@ -14,6 +14,7 @@ from lerobot_agpd.studies.tables import (
     cost_table,
     difference_table,
     markdown,
+    outcome_table,
     results_table,
     summary_table,
     ways_table,
@@ -102,26 +103,33 @@ def _methods(matrix: Matrix, results: Mapping[str, Methods]) -> list[str]:
 
 
 def _task(matrix: Matrix, task: str, methods: Methods, pictures: str) -> list[str]:
+    """One picture and one table, and everything else in folds."""
     measure = matrix.tasks[task].measure
+    references = [name for name in matrix.references or methods if name in methods]
+    reference = next((name for name in ("pd", *references) if name in methods and len(methods) > 1), None)
     parts = [
         f"![outcomes]({pictures}outcomes-{task}.png)",
-        markdown(results_table(methods, measure, len(matrix.seeds))),
+        markdown(outcome_table(methods, measure, reference)),
     ]
-    references = [name for name in matrix.references or methods if name in methods]
+    everything = [markdown(results_table(methods, measure, len(matrix.seeds)))]
     if len(methods) > 1 and references:
-        parts.append(f"Paired differences in {LABELS[measure]}, last checkpoint (row minus column):")
-        parts.append(markdown(difference_table(methods, references, "last", measure)))
-    parts.append(f"![learning curves]({pictures}curves-{task}.png)")
-    parts += ["### What it took", markdown(cost_table(methods))]
+        everything.append(f"Paired differences in {LABELS[measure]}, last checkpoint (row minus column):")
+        everything.append(markdown(difference_table(methods, references, "last", measure)))
+    parts.append(_fold("All checkpoints, measures and paired differences", everything))
+    parts.append(_fold("Learning curves", [f"![learning curves]({pictures}curves-{task}.png)"]))
+    parts.append(_fold("What it took", [markdown(cost_table(methods))]))
     if rows := collection_table(methods):
-        parts += ["### What the rounds did", markdown(rows)]
+        parts.append(_fold("What the rounds did", [markdown(rows)]))
     if rows := ways_table(methods):
-        parts += [
-            "### Which way the kept episodes took",
-            WAYS_NOTE.replace("\n", " ").rstrip(),
-            markdown(rows),
-        ]
+        note = WAYS_NOTE.replace("\n", " ").rstrip()
+        parts.append(_fold("Which way the kept episodes took", [note, markdown(rows)]))
     return parts
+
+
+def _fold(title: str, parts: Sequence[str]) -> str:
+    """Markdown that a reader opens; GitHub and the documentation's site both know it."""
+    content = "\n\n".join(parts)
+    return f'<details markdown="1">\n<summary>{title}</summary>\n\n{content}\n\n</details>'
 
 
 def _notes(matrix: Matrix, results: Mapping[str, Methods]) -> list[str]:

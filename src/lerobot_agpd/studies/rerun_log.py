@@ -56,7 +56,9 @@ def layout(root: str, rollout: RolloutRecord) -> rrb.Container:
     if len(rollout.frames) or rollout.to_frame is not None:
         pictures.insert(0, f"{root}/frame")
     n_dims = rollout.episode.actions.shape[1]
-    dims = (rrb.TimeSeriesView(origin=f"{root}/chunk/{dim}", name=f"action {dim}") for dim in range(n_dims))
+    dims = (
+        rrb.TimeSeriesView(origin=f"{root}/chunk/{dim}", name=rollout.name_of(dim)) for dim in range(n_dims)
+    )
     chunks = rrb.Grid(*dims, grid_columns=min(n_dims, MAX_SERIES_COLUMNS), name="chunks")
     guidance = rrb.Horizontal(
         rrb.TimeSeriesView(origin=f"{root}/discrepancy", name="discrepancy J"),

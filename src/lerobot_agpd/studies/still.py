@@ -68,7 +68,7 @@ def _draw_dimensions(rollout: RolloutRecord, decision: DecisionRecord) -> Figure
     for dim, axes in enumerate(grid[:n_dims]):
         for name, chunk in decision.chunks.items():
             axes.plot(decision.step + np.arange(len(chunk)), chunk[:, dim], ".-", color=_rgb(name))
-        axes.set_title(f"action {dim}", fontsize="medium")
+        axes.set_title(rollout.name_of(dim), fontsize="medium")
         if dim >= n_dims - n_columns:
             axes.set_xlabel("step")
     for axes in grid[n_dims:]:

@@ -19,6 +19,7 @@ from lerobot_agpd.studies.results import (
     difference,
     pooled,
 )
+from lerobot_agpd.studies.ways import RoundWays
 
 Row = tuple[str, ...]
 
@@ -77,8 +78,37 @@ def summary_table(results: Sequence[Result]) -> list[Row]:
 # ---- a comparison ----
 
 
+def outcome_table(methods: Methods, measure: str, reference: str | None) -> list[Row]:
+    """What to look at first: the task's measure at the last checkpoint, and the difference to one method.
+
+    Args:
+        methods: a task's results.
+        measure: what the task is measured by.
+        reference: the method that the others are compared with; None: no such column.
+    """
+    rows: list[Row] = [("", "training seeds", "gradient steps", f"{LABELS[measure]}, last", "by seed")]
+    if reference is not None:
+        rows[0] += (f"minus `{reference}`",)
+    for name, runs in methods.items():
+        trained = runs[0].steps is not None
+        by_seed = [f"{pooled([result], 'last', measure).mean:.2f}" for result in runs]
+        cells = [
+            name,
+            str(len(runs)) if trained else "-",
+            str(runs[0].steps) if trained else "-",
+            str(pooled(runs, "last", measure)),
+            " / ".join(by_seed) if len(runs) > 1 else "-",
+        ]
+        if reference is not None:
+            cells.append(
+                "" if name == reference else difference_cell(runs, methods[reference], "last", measure)
+            )
+        rows.append(tuple(cells))
+    return rows
+
+
 def results_table(methods: Methods, measure: str, n_seeds: int) -> list[Row]:
-    """What the methods achieved: the task's measure first, then the other one if it adds anything.
+    """Everything that the methods achieved: the task's measure first, then the other one if it adds anything.
 
     Args:
         methods: a task's results.
@@ -219,6 +249,17 @@ def ways_table(methods: Methods) -> list[Row]:
         if cells:
             rows.append((name, *cells, *[""] * (longest - len(cells))))
     return rows if longest else []
+
+
+def round_ways_table(ways: Sequence[RoundWays]) -> list[Row]:
+    """One row per collection round of a run: kept episodes on every way, and their entropy; empty without ways."""
+    if not ways:
+        return []
+    header = ("round", *(f"way {way}" for way in range(len(ways[0].total))), "entropy")
+    rows = [
+        (str(number), *map(str, round_.total), f"{round_.entropy:.2f}") for number, round_ in enumerate(ways)
+    ]
+    return [header, *rows]
 
 
 def rounds_table(rounds: Sequence[RoundReport]) -> list[Row]:

@@ -10,7 +10,9 @@ from lerobot.policies.diffusion.modeling_diffusion import DiffusionModel, Diffus
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
+from lerobot_agpd.cards.model_card import ModelFacts
 from lerobot_agpd.config import require
+from lerobot_agpd.policies.carded import CardedPolicy
 from lerobot_agpd.policies.diffusion_transformer.averaged_weights import AveragedWeights
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
     DiffusionTransformerConfig,
@@ -22,10 +24,15 @@ from lerobot_agpd.replay.demonstrations import DemonstrationFrames, delivers_sin
 from lerobot_agpd.replay.normalization import Statistics
 from lerobot_agpd.replay.served_frames import serve_from_memory
 from lerobot_agpd.run import RunInfo
-from lerobot_agpd.weights import is_main_process, require_weights
+from lerobot_agpd.weights import acting_parameters, is_main_process, require_weights
+
+SUMMARY = """\
+A diffusion policy for [LeRobot](https://github.com/huggingface/lerobot), of a type that the plugin lerobot_policy_agpd
+adds. It can teach a faster policy there."""
+"""First paragraph of the model card."""
 
 
-class DiffusionTransformerPolicy(DiffusionPolicy):
+class DiffusionTransformerPolicy(CardedPolicy, DiffusionPolicy):
     """Diffusion policy (arXiv:2303.04137) with an MLP, a transformer or LeRobot's U-Net as its denoiser.
 
     The averaged (EMA) weights are the policy's weights everywhere but in training mode: `eval()` swaps them
@@ -111,6 +118,22 @@ class DiffusionTransformerPolicy(DiffusionPolicy):
         return average
 
     # ---- checkpoints ----
+
+    def model_facts(self) -> ModelFacts | None:
+        """What the model card says of the run; None outside of one."""
+        dataset = self._dataset[0]
+        if dataset is None:
+            return None
+        config = self.config
+        facts = {
+            "demonstrations": f"`{dataset.repo_id}`, {dataset.fps} fps",
+            "denoiser": config.denoiser,
+            "denoising steps": f"{config.num_inference_steps or config.num_train_timesteps}, {config.noise_scheduler_type}",
+            "parameters": f"{acting_parameters(self) / 1e6:.2f} M",
+            "chunk": f"{config.horizon} steps, {config.n_action_steps} executed",
+            "training steps": str(self.run.steps or "unknown"),
+        }
+        return ModelFacts(SUMMARY, facts, dataset.repo_id, env=self.run.env, resumed=self.run.resume)
 
     @classmethod
     def _load_as_safetensor[T: PreTrainedPolicy](
