@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -61,7 +62,7 @@ class ChunkGraph(nn.Module):
         assert isinstance(loaded.policy, ACTPolicy)
         self.network = loaded.policy.model
         self.preprocessor, self.postprocessor = loaded.preprocessor, loaded.postprocessor
-        self.features = dict(loaded.policy.config.input_features)
+        self.features = dict(loaded.policy.config.input_features or {})
         self.image_features = list(loaded.policy.config.image_features)
 
     def forward(self, *observations: Tensor) -> Tensor:
@@ -152,7 +153,7 @@ def export_onnx(loaded: LoadedPolicy, folder: Path) -> OnnxExport:
         raise RuntimeError(f"the chunks of {path} differ from the policy's by {difference:.2e}")
     one = graph.examples(batch_size=1, seed=1)
     torch_ms, onnx_ms = (
-        float(np.median(call_times(lambda run=run: run(one), REPEATS))) for run in (by_torch, by_onnx)
+        float(np.median(call_times(partial(run, one), REPEATS))) for run in (by_torch, by_onnx)
     )
     return OnnxExport(path, difference, torch_ms, onnx_ms)
 

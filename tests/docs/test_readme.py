@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PAGES = [
     path
-    for pattern in ("*.md", "docs/**/*.md", "benchmarks/**/*.md")
+    for pattern in ("*.md", "docs/**/*.md")
     for path in sorted(ROOT.glob(pattern))
     if path.name != "model_card.md"  # a card of the Hub
 ]

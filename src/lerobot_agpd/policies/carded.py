@@ -15,7 +15,9 @@ from lerobot_agpd.weights import is_main_process
 class CardedPolicy:
     """Mixin: a policy that writes its model card beside its weights, before LeRobot's policy in the bases."""
 
-    config: PreTrainedConfig
+    @property
+    def _own_config(self) -> PreTrainedConfig:
+        return self.config  # type: ignore[attr-defined, no-any-return]  # of the policy that it is mixed into
 
     @abstractmethod
     def model_facts(self) -> ModelFacts | None:
@@ -25,8 +27,8 @@ class CardedPolicy:
         """The card that `push_model_to_hub` uploads; LeRobot's own knows no plugin."""
         facts = self.model_facts()
         if facts is None:
-            return super().generate_model_card(*args, **kwargs)  # type: ignore[misc, no-any-return]
-        card = model_card(self.config, facts)
+            return super().generate_model_card(*args, **kwargs)  # type: ignore[misc]
+        card = model_card(self._own_config, facts)
         card.validate()  # by the Hub
         return card
 
@@ -34,4 +36,4 @@ class CardedPolicy:
         super()._save_pretrained(save_directory, **kwargs)  # type: ignore[misc]
         facts = self.model_facts()
         if facts is not None and is_main_process():
-            write_text(Path(save_directory) / CARD, str(model_card(self.config, facts)))
+            write_text(Path(save_directory) / CARD, str(model_card(self._own_config, facts)))

@@ -230,7 +230,7 @@ class DistilledPolicy(CardedPolicy, Student):
         return distillation_facts(self._agpd, acting_parameters(self), dataset)
 
     def _save_pretrained(self, save_directory: Path, **kwargs: Any) -> None:
-        super()._save_pretrained(save_directory, **kwargs)  # type: ignore[misc]
+        super()._save_pretrained(save_directory, **kwargs)
         if self._agpd is not None and PartialState().is_main_process:
             self._agpd.save(save_directory)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -68,7 +69,8 @@ def _thumbnails(
     env: gym.vector.VectorEnv, records: Sequence[EpisodeRecord], kept: dict[int, StoredEpisode]
 ) -> Iterator[Thumbnail]:
     for record in records:
-        env.reset(seed=[record.seed], options={NEW_ROLLOUT_OPTION: True})
+        seed: Any = [record.seed]
+        env.reset(seed=seed, options={NEW_ROLLOUT_OPTION: True})
         if record.kept:
             actions = np.asarray(kept[record.number].column(ACTION))
             for action in actions[:-1]:  # behind the last one the next episode begins

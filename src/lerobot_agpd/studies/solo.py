@@ -52,6 +52,10 @@ class SoloEnvironment:
         clips = []
         for seed in seeds:
             frames: list[Array] = []
+
+            def render(env: gym.vector.VectorEnv, frames: list[Array] = frames) -> None:
+                frames.append(rendered_frame(env))
+
             with torch.no_grad(), seeded_context(seed):
                 episode = rollout(
                     self.env,
@@ -60,7 +64,7 @@ class SoloEnvironment:
                     loaded.preprocessor,
                     loaded.postprocessor,
                     seeds=[seed],
-                    render_callback=lambda env, frames=frames: frames.append(rendered_frame(env)),
+                    render_callback=render,
                 )
             n_steps = episode[ACTION].shape[1]
             frames = frames[:n_steps]  # behind the last step the next episode has begun
