@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # ALOHA transfer-cube from object poses: scripted demonstrations, a diffusion teacher, a distilled student. Episodes are
-# long (50 steps per second, up to 400 steps); a few hours on one CPU core.
+# long (50 steps per second, up to 400 steps).
 # usage: examples/aloha.sh [output folder]
 source "$(dirname "$0")/common.sh"
 output=${1:-outputs/transfer_cube}

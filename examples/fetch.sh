@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Fetch: scripted demonstrations, a diffusion teacher, a distilled student. Half an hour on one CPU core.
+# Fetch: scripted demonstrations, a diffusion teacher, a distilled student.
 # usage: examples/fetch.sh [task, default FetchPickAndPlace-v4] [output folder]
 # With demonstrations of operators of mixed skill (the low-quality setting) for the student:
 #   SKILL="[1,0.75,0.5,0.25]" examples/fetch.sh FetchPush-v4 outputs/mixture

@@ -1,4 +1,4 @@
-"""Distill a student on FetchReach from Python, offline, in two minutes on one CPU core: demonstrations, teacher, student.
+"""Distill a student on FetchReach from Python, offline, on a CPU: demonstrations, teacher, student.
 
 Usage: python examples/train_fetchreach.py
 

@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import rerun as rr
+from gymnasium.vector import SyncVectorEnv
 
 from lerobot_agpd.replay.episode import Episode, EpisodeSpec
-from lerobot_agpd.studies.recording import COLORS, DecisionRecord, RolloutRecord
+from lerobot_agpd.studies.recording import COLORS, DecisionRecord, RolloutRecord, action_names
 from lerobot_agpd.studies.rerun_log import TIMELINE, blueprint, layout, log_rollout
 from lerobot_agpd.studies.still import draw_still
 
@@ -125,3 +127,20 @@ def test_still_of_a_single_decision(tmp_path):
     rollout = make_rollout()
     draw_still(replace(rollout, decisions=rollout.decisions[:1]), tmp_path / "still.png")
     assert (tmp_path / "still.png").stat().st_size > 0
+
+
+def test_actions_have_the_environments_names():
+    rollout = replace(make_rollout(), action_names=("left", "right"))
+    assert [rollout.name_of(dim) for dim in range(2)] == ["left", "right"]
+    assert make_rollout().name_of(1) == "action 1"
+    named = SyncVectorEnv([NamedActions])
+    assert action_names(named) == ["force x", "force y"]
+    named.envs[0].action_names = ("one",)  # of another action
+    assert action_names(named) == ["action 0", "action 1"]
+
+
+class NamedActions(gym.Env):
+    """Says what its actions are."""
+
+    observation_space, action_space = gym.spaces.Box(0, 1, (1,)), gym.spaces.Box(0, 1, (2,))
+    action_names = ("force x", "force y")

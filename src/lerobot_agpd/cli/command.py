@@ -11,6 +11,7 @@ from functools import wraps
 from typing import get_type_hints
 
 import draccus
+import torch
 from draccus.utils import DraccusException
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs import EnvConfig
@@ -72,6 +73,12 @@ def _parse[C](config_class: type[C], args: list[str]) -> C:
         config_path = parser.extract_path_fields_from_config(config_path, path_fields)
         args = parser.filter_arg("config_path", args)
     return draccus.parse(config_class=config_class, config_path=config_path, args=args)
+
+
+def machine_device() -> str:
+    """Where policies run if nobody says: this machine's accelerator (CUDA, MPS, ...), else the CPU."""
+    accelerator = torch.accelerator.current_accelerator() if torch.accelerator.is_available() else None
+    return accelerator.type if accelerator is not None else "cpu"
 
 
 @dataclass(kw_only=True)

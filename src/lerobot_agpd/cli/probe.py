@@ -14,7 +14,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import EnvConfig
 from rich.console import Console
 
-from lerobot_agpd.cli.command import entry_point
+from lerobot_agpd.cli.command import entry_point, machine_device
 from lerobot_agpd.config import EVALUATION_SEEDS, TeacherConfig, require
 from lerobot_agpd.files import write_json
 from lerobot_agpd.loading import (
@@ -92,8 +92,8 @@ class ProbeConfig:
     seed: int = 0
     # First environment seed; training and collection stay away from 100000 to 999999.
     env_seed: int = EVALUATION_SEEDS[0]
-    # Where policies run.
-    device: str = "cpu"
+    # Where policies run; default: this machine's accelerator, else the CPU.
+    device: str = ""
 
     def __post_init__(self) -> None:
         """Read the student's configuration, if there is one, and check the options.
@@ -102,6 +102,7 @@ class ProbeConfig:
             FlagError: if teacher or demonstrations are not named, or a number is out of range.
             FileNotFoundError: if there is no policy where one should be.
         """
+        self.device = self.device or machine_device()
         path = parser.get_path_arg("policy")
         if path:
             self.policy = read_policy_config(path, "--policy.path")

@@ -11,7 +11,7 @@ from lerobot.envs import EnvConfig
 from rich.console import Console
 
 from lerobot_agpd.cards.model_card import add_results, environment_flags
-from lerobot_agpd.cli.command import entry_point
+from lerobot_agpd.cli.command import entry_point, machine_device
 from lerobot_agpd.config import EVALUATION_SEEDS, require
 from lerobot_agpd.progress import REPLAY_FOLDER
 from lerobot_agpd.replay.journal import EpisodeJournal
@@ -56,8 +56,8 @@ class ReportConfig:
     batch_size: int = 50
     # First environment seed; training and collection stay away from 100000 to 999999.
     seed: int = EVALUATION_SEEDS[0]
-    # Where policies run.
-    device: str = "cpu"
+    # Where policies run; default: this machine's accelerator, else the CPU.
+    device: str = ""
     # Title of picture and page.
     title: str = ""
     # Further pictures or films to show on the page.
@@ -66,6 +66,7 @@ class ReportConfig:
     sheet_episodes: int = 0
 
     def __post_init__(self) -> None:
+        self.device = self.device or machine_device()
         require(
             bool(self.runs or self.policies),
             "nothing to report: name runs (--runs='{name: folder}') or --policies",

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from lerobot_agpd.agpd import GuidedStrategy
-from lerobot_agpd.cli.command import StudentFlags, entry_point
+from lerobot_agpd.cli.command import StudentFlags, entry_point, machine_device
 from lerobot_agpd.config import EVALUATION_SEEDS, require
 from lerobot_agpd.guidance.strength import first_strength, require_strength
 from lerobot_agpd.guidance.teacher import Teacher
@@ -66,8 +66,8 @@ class VizConfig(StudentFlags):
     panel_width: int = 240
     # Show every how many-th step in the animation.
     stride: int = 1
-    # Where the policies of --policies run.
-    device: str = "cpu"
+    # Where the policies of --policies run; default: this machine's accelerator, else the CPU.
+    device: str = ""
     # Record rendered frames.
     render: bool = True
     # Show the finished recording in a rerun viewer.
@@ -79,6 +79,7 @@ class VizConfig(StudentFlags):
         Raises:
             ValueError: if there is no checkpoint, or a number is out of range.
         """
+        self.device = self.device or machine_device()
         self._check_animation()
         if not self.records:
             return

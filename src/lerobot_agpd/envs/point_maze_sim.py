@@ -60,6 +60,7 @@ class PointMazeWays(ViewedEnv):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
     render_mode = "rgb_array"
+    action_names = ("force x", "force y")
 
     def __init__(self, task: str, view: View) -> None:
         """Build the simulation of a key of `maze_tasks.TASKS`; no graphics context is opened before the first image."""

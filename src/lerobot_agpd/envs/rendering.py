@@ -6,6 +6,7 @@ the first image of a size, and each is made current before use.
 """
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -76,12 +77,14 @@ class ViewedEnv(gym.Env):
         state: `agent_pos` and `environment_state` of the last observation, whatever the view shows: for experts.
         main_camera: camera of rendered frames, and of an observed image without a name.
         task_description: one sentence, for LeRobot.
+        action_names: of the action's dimensions, for pictures; empty: they have none.
     """
 
     view: View
     state: dict[str, np.ndarray]
     main_camera: Camera = "top"
     task_description: str
+    action_names: Sequence[str] = ()
 
     def set_view(self, view: View, spec: TaskSpec, hidden_group: int | None = None) -> None:
         """Declare the observations of a task; `hidden_group` of the model's geometry is in no image."""

@@ -46,6 +46,9 @@ Values are those of robomimic's `docs/modules/environments.md` (v0.5.0), where `
 ARM_ACTION_DIM = 7
 """Per arm: displacement x, y, z (1 is 5 cm), rotation vector x, y, z (1 is 0.5 rad), gripper (-1 open, 1 closed)."""
 
+ARM_ACTION_NAMES = ("move x", "move y", "move z", "turn x", "turn y", "turn z", "gripper")
+"""The same, for pictures."""
+
 ARM_KEYS = ("eef_pos", "eef_quat", "gripper_qpos")
 """Observables of an arm for robomimic's low-dimensional policies, in its order, without the prefix `robot0_` or `robot1_`."""
 

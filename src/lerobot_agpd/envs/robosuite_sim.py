@@ -15,7 +15,7 @@ import numpy as np
 
 from lerobot_agpd.envs.base import View
 from lerobot_agpd.envs.rendering import ViewedEnv
-from lerobot_agpd.envs.robomimic_tasks import ARM_CONTROLLER, FPS, ROBOT, TASKS
+from lerobot_agpd.envs.robomimic_tasks import ARM_ACTION_NAMES, ARM_CONTROLLER, FPS, ROBOT, TASKS
 
 # robosuite warns at import of optional packages and of a settings file that hardly anybody has. Its logger sets its
 # own level during the import, which only a filter survives.
@@ -65,6 +65,7 @@ class RobosuiteEnv(ViewedEnv):
         self.set_view(view or View(), self.spec_of_task, hidden_group=COLLISION_GROUP)
         self.main_camera = self.spec_of_task.cameras[0]
         self.action_space = gym.spaces.Box(-1.0, 1.0, (self.spec_of_task.action_dim,), dtype=np.float32)
+        self.action_names = ARM_ACTION_NAMES * self.spec_of_task.n_robots
         self._has_foreign_model = False
 
     def _build(self) -> Any:

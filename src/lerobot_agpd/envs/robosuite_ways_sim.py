@@ -25,7 +25,7 @@ from lerobot_agpd.envs.lift_tasks import (
 )
 from lerobot_agpd.envs.operational_space import OperationalSpace
 from lerobot_agpd.envs.rendering import ViewedEnv
-from lerobot_agpd.envs.robomimic_tasks import ROBOT
+from lerobot_agpd.envs.robomimic_tasks import ARM_ACTION_NAMES, ROBOT
 from lerobot_agpd.envs.robosuite_sim import COLLISION_GROUP, MODEL_SEED, numpy_seeded
 
 # isort: split
@@ -139,6 +139,7 @@ class LiftWays(ViewedEnv):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
     render_mode = "rgb_array"
+    action_names = ARM_ACTION_NAMES
 
     def __init__(self, task: str, view: View | None = None) -> None:
         """Build the simulation of a key of `lift_tasks.TASKS`; no graphics context is opened before the first image."""

@@ -17,7 +17,7 @@ class CardedPolicy:
 
     @property
     def _own_config(self) -> PreTrainedConfig:
-        return self.config  # type: ignore[attr-defined, no-any-return]  # of the policy that it is mixed into
+        return self.config  # type: ignore[attr-defined]  # of the policy that it is mixed into
 
     @abstractmethod
     def model_facts(self) -> ModelFacts | None:
