@@ -13,7 +13,7 @@ from lerobot.envs import EnvConfig
 from lerobot_agpd.config import StudentConfig, require
 from lerobot_agpd.guidance.strength import STEPS_FLAG, first_strength, require_strength
 from lerobot_agpd.guidance.teacher import Teacher
-from lerobot_agpd.loading import check_fit, collection_environment, load_teacher
+from lerobot_agpd.loading import check_fit, collection_environment, load_teacher, vectors
 from lerobot_agpd.progress import Progress, find_replay_root
 from lerobot_agpd.replay.demonstrations import DemonstrationFrames
 from lerobot_agpd.replay.export import check_observation
@@ -22,6 +22,7 @@ from lerobot_agpd.replay.normalization import Statistics
 from lerobot_agpd.replay.replay import Replay
 from lerobot_agpd.replay.teacher_chunks import TeacherChunks
 from lerobot_agpd.rollout.collector import Collector
+from lerobot_agpd.rollout.first_observation import first_observation
 from lerobot_agpd.rollout.report import RoundReport, read_reports
 from lerobot_agpd.run import RunInfo
 from lerobot_agpd.self_distillation import SelfTeacher
@@ -88,14 +89,15 @@ def build_parts(
         "--parallelism.*: AGPD collects with whole policies, so it cannot shard them; use DDP",
     )
     progress = Progress.restore(config, run)
-    demonstrations = DemonstrationFrames(config, dataset_meta, dataset_stats)
-    meta = demonstrations.dataset.meta
-    replay = Replay(demonstrations, config, config.replay.collected_fraction, run.image_transforms)
-    replay.seen_episodes.update(progress.seen_episodes)
     self_teacher = _self_teacher(student, progress)
     teacher = None if self_teacher else _teacher(config)
     env_config = collection_environment(config.collect, run) if config.collect.enabled else None
-    check_fit(config, teacher, meta, env_config)
+    check_fit(config, teacher, dataset_meta, env_config)
+    seen_by_teacher = vectors(teacher.input_features) if teacher else []
+    demonstrations = DemonstrationFrames(config, dataset_meta, dataset_stats, seen_by_teacher)
+    meta = demonstrations.dataset.meta
+    replay = Replay(demonstrations, config, config.replay.collected_fraction, run.image_transforms)
+    replay.seen_episodes.update(progress.seen_episodes)
     collector, journal = None, None
     if env_config is not None:
         _check_steps(student, teacher, demonstrations)
@@ -103,6 +105,8 @@ def build_parts(
         _warn_of_settings(config)
         journal = _journal(config, run, progress, meta, env_config, seed)
         check = partial(check_observation, meta.features)
+        if config.image_features or (teacher and len(seen_by_teacher) < len(teacher.input_features)):
+            check(first_observation(env_config, config))  # environments declare sizes that they do not always deliver
         rank, n_ranks = processes.process_index, processes.num_processes
         collector = Collector(config, env_config, meta, journal, check, seed, rank, n_ranks)
     return Parts(

@@ -337,6 +337,26 @@ class StudentConfig(PreTrainedConfig):
     collect: CollectConfig = field(default_factory=CollectConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     adversary: AdversaryConfig = field(default_factory=AdversaryConfig)
+    # Features of the demonstrations that the student sees, e.g. "[observation.state,observation.image]"; default: all.
+    # The teacher sees what it was trained on, whatever the student sees.
+    inputs: list[str] | None = None
+
+    def select_inputs(self) -> None:
+        """Leave of `input_features`, which LeRobot fills with all of a dataset's, those that `inputs` names.
+
+        Raises:
+            FlagError: if one of them does not exist.
+        """
+        if self.inputs is None:
+            return
+        available = self.input_features or {}
+        missing = sorted(set(self.inputs) - set(available))
+        require(
+            not missing,
+            f"--policy.inputs={self.inputs}: {missing} is not among the features of the demonstrations "
+            f"(--dataset.*), which hold {sorted(available)}",
+        )
+        self.input_features = {key: available[key] for key in available if key in self.inputs}
 
     @property
     @abstractmethod

@@ -49,7 +49,8 @@ class RoboticsWrapper(ViewedEnv, gym.Wrapper, gym.utils.RecordConstructorArgs):
         if isinstance(goal, dict):  # the kitchen, whose goal names the tasks
             self.task_description = f"Kitchen: {', '.join(goal)}."
         self._simulation: Any = getattr(env.unwrapped, "robot_env", env.unwrapped)  # the kitchen's robot
-        self.main_camera = configured_camera(self._simulation)
+        if view.main_pose is None:
+            self.main_camera = configured_camera(self._simulation)
 
     def scene(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """Model and data of the simulation."""

@@ -15,7 +15,7 @@ from torch import Tensor
 from lerobot_agpd.replay.demonstrations import Batch, DemonstrationFrames
 from lerobot_agpd.replay.frames import ChunkStarts
 from lerobot_agpd.replay.gate import FarValues
-from lerobot_agpd.replay.images import RecordedFrames
+from lerobot_agpd.replay.images import RecordedFrames, as_floats
 from lerobot_agpd.replay.stored import StoredEpisode
 
 logger = logging.getLogger(__name__)
@@ -106,15 +106,15 @@ class Replay:
         return len(self.table) - self.n_demonstration_frames
 
     def extend(self, episodes: Iterable[StoredEpisode]) -> None:
-        """Append kept episodes: their columns to memory, their camera frames stay on disk.
+        """Append kept episodes: their columns, and as many of their camera frames as fit, to memory.
 
         Raises:
-            KeyError: if an episode lacks one of the demonstrations' features.
+            KeyError: if an episode lacks one of the features in memory.
             ValueError: if an episode is damaged.
         """
         n_starts, n_frames = len(self._collected_starts), len(self.table)
         for episode in episodes:
-            first, keys = len(self.table), self.demonstrations.keys
+            first, keys = len(self.table), list(self.table.columns)
             self.table.append({key: _column(episode, key) for key in keys}, [len(episode)])
             self.frames.append(episode)
             self._collected_starts.append(first, len(episode))
@@ -128,11 +128,6 @@ class Replay:
                 "none of the new episodes is longer than --policy.drop_n_last_frames=%d: none is trained on",
                 self._collected_starts.n_dropped,
             )
-
-    @property
-    def vector_keys(self) -> list[str]:
-        """Low-dimensional observation features."""
-        return [key for key in self.demonstrations.keys if key != ACTION]
 
     # ---- batches ----
 
@@ -179,29 +174,31 @@ class Replay:
         return {**images, **gathered, FRAME_INDEX: frame_index}
 
     def _images(self, batch: Batch, frame_index: Tensor, augment: bool) -> Batch:
-        """Normalized camera frames; those that the loader did not deliver are read from disk."""
+        """Normalized camera frames; those that the loader did not deliver are T's own."""
         if not self._cameras:
             return {}
         if self.config.history_length is not None:
-            histories = self.history(frame_index, self._cameras, self.config.history_length)
-            return {
-                key: self._normalized(key, histories[key], augment).to(batch[key]) for key in self._cameras
-            }
+            histories = self.frames.images(frame_index, self._cameras, self.config.history_length)
+            return {key: self._normalized(key, histories[key], batch[key], augment) for key in self._cameras}
         images = {key: batch[key] for key in self._cameras}
         exchanged = frame_index != batch["index"]
         if exchanged.any():
             read = self.frames.images(frame_index[exchanged], self._cameras)
             for key in self._cameras:
                 images[key] = images[key].clone()
-                images[key][exchanged] = self._normalized(key, read[key], augment).to(images[key])
+                images[key][exchanged] = self._normalized(key, read[key], images[key], augment)
         return images
 
-    def _normalized(self, key: str, images: Tensor, augment: bool) -> Tensor:
-        """A camera's frames or histories (B, ..., C, H, W), normalized; each gets one draw of the transforms."""
+    def _normalized(self, key: str, images: Tensor, like: Tensor, augment: bool) -> Tensor:
+        """A camera's frames or histories (B, ..., C, H, W), normalized; each gets one draw of the transforms.
+
+        They stay uint8, a quarter of the size, until they are on the device of `like`.
+        """
+        images = as_floats(images.to(like.device))
         is_depth = key in self.demonstrations.dataset.meta.depth_keys
         if augment and self.image_transforms is not None and not is_depth:
             images = torch.stack([self.image_transforms(image) for image in images])
-        return self.demonstrations.normalizer.normalize(key, images)
+        return self.demonstrations.normalizer.normalize(key, images).to(like)
 
     # ---- observations of frames ----
 

@@ -32,6 +32,7 @@ class AGPDPolicy(DistilledPolicy, ACTPolicy):  # type: ignore[misc]
         **kwargs: Any,
     ):
         """Build ACT and the adversary; without `dataset_meta` the policy can be evaluated but not trained."""
+        config.select_inputs()
         super().__init__(config, **kwargs)
         self.init_distillation(dataset_meta, dataset_stats, run)
 
