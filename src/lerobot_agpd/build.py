@@ -106,7 +106,9 @@ def build_parts(
         journal = _journal(config, run, progress, meta, env_config, seed)
         check = partial(check_observation, meta.features)
         if config.image_features or (teacher and len(seen_by_teacher) < len(teacher.input_features)):
-            check(first_observation(env_config, config))  # environments declare sizes that they do not always deliver
+            check(
+                first_observation(env_config, config)
+            )  # environments declare sizes that they do not always deliver
         rank, n_ranks = processes.process_index, processes.num_processes
         collector = Collector(config, env_config, meta, journal, check, seed, rank, n_ranks)
     return Parts(

@@ -195,7 +195,9 @@ def test_defaults_follow_the_task(config, episode_length, cameras):
         FetchWaysEnv(obs_type=EVERYTHING),
         PushTStateEnvConfig(obs_type=EVERYTHING),
         *(
-            pytest.param(kind(obs_type=EVERYTHING, observation_height=24, shadows=False), marks=pytest.mark.slow)
+            pytest.param(
+                kind(obs_type=EVERYTHING, observation_height=24, shadows=False), marks=pytest.mark.slow
+            )
             for kind in (AlohaStateEnvConfig, PointMazeWaysEnv, RobomimicEnvConfig, RobosuiteWaysEnv)
         ),
     ],

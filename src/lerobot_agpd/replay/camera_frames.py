@@ -109,7 +109,12 @@ class CameraFrames:
         size = int(np.prod(shape)) * dtype.itemsize
         if self._take(size):
             return np.empty(shape, dtype=dtype)
-        logger.info("'%s' of the demonstrations, %.1f GB, is memory-mapped in %s", key, size / 1e9, tempfile.gettempdir())
+        logger.info(
+            "'%s' of the demonstrations, %.1f GB, is memory-mapped in %s",
+            key,
+            size / 1e9,
+            tempfile.gettempdir(),
+        )
         with tempfile.TemporaryFile() as file:  # it lives as long as it is mapped
             file.truncate(size)
             return np.memmap(file, dtype=dtype, mode="r+", shape=shape)

@@ -37,7 +37,9 @@ class RecordedFrames:
         self._episode_tasks.append(episode.task)
         self.cameras.append(episode)
 
-    def images(self, frame_index: Tensor, keys: Sequence[str], n_obs_steps: int | None = None) -> dict[str, Tensor]:
+    def images(
+        self, frame_index: Tensor, keys: Sequence[str], n_obs_steps: int | None = None
+    ) -> dict[str, Tensor]:
         """Cameras' frames (B, C, H, W) in uint8 (depth: float32); each distinct demonstration frame is decoded once.
 
         With `n_obs_steps` histories (B, n_obs_steps, C, H, W); an episode's first frame repeats.

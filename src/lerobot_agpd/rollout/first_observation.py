@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors, preprocess_observation
+from torch import Tensor
 
 from lerobot_agpd.config import COLLECTION_SEEDS
 from lerobot_agpd.replay.episode import Array
@@ -17,6 +18,7 @@ def first_observation(env_config: EnvConfig, policy_config: PreTrainedConfig) ->
         envs = next(envs for suite in tasks.values() for envs in suite.values())
         preprocess, _ = make_env_pre_post_processors(env_config, policy_config)
         observation, _ = envs.reset(seed=[COLLECTION_SEEDS[0]])
-        return {key: as_recorded(value[0]) for key, value in preprocess(preprocess_observation(observation)).items()}
+        processed = preprocess(preprocess_observation(observation))
+        return {key: as_recorded(value[0]) for key, value in processed.items() if isinstance(value, Tensor)}
     finally:
         close_envs(tasks)
