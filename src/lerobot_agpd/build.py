@@ -17,6 +17,7 @@ from lerobot_agpd.loading import check_fit, collection_environment, load_teacher
 from lerobot_agpd.progress import Progress, find_replay_root
 from lerobot_agpd.replay.demonstrations import DemonstrationFrames
 from lerobot_agpd.replay.export import check_observation
+from lerobot_agpd.replay.frame_features import FrameFeatures
 from lerobot_agpd.replay.journal import EpisodeJournal
 from lerobot_agpd.replay.normalization import Statistics
 from lerobot_agpd.replay.replay import Replay
@@ -39,6 +40,8 @@ class Parts:
         run: the training run.
         progress: counters, restored if the run continues a checkpoint.
         replay: T.
+        frame_features: what the representation predicts of T's camera frames; None where it predicts vectors, or there is
+            none.
         teacher: None without one, and in self-distillation.
         self_teacher: in self-distillation.
         teacher_chunks: the teacher's chunks on T; None if neither adversary nor relabeling uses them.
@@ -52,6 +55,7 @@ class Parts:
     run: RunInfo
     progress: Progress
     replay: Replay
+    frame_features: FrameFeatures | None
     teacher: Teacher | None
     self_teacher: SelfTeacher | None
     teacher_chunks: TeacherChunks | None
@@ -115,6 +119,7 @@ def build_parts(
         run=run,
         progress=progress,
         replay=replay,
+        frame_features=_frame_features(student, replay),
         teacher=teacher,
         self_teacher=self_teacher,
         teacher_chunks=_teacher_chunks(config, teacher, replay, seed),
@@ -124,6 +129,13 @@ def build_parts(
         seed=seed,
         rank=processes.process_index,
     )
+
+
+def _frame_features(student: Student, replay: Replay) -> FrameFeatures | None:
+    encoder, config = student.visual_encoder, student.config
+    if encoder is None:
+        return None
+    return FrameFeatures(replay.frames, list(config.image_features), encoder, replay.demonstrations)
 
 
 # ---- teacher ----
@@ -224,6 +236,8 @@ def _identity(config: StudentConfig, env_config: EnvConfig, seed: int) -> dict[s
         identity |= {f"guidance.{name}": value for name, value in asdict(config.guidance).items()}
     if collect.guides or collect.strategy == "nearest":
         identity["representation.type"] = config.representation.type
+        if config.representation.type == "visual":
+            identity["representation.encoder"] = config.representation.encoder
     if collect.strategy == "mixing":
         identity["collect.mixing"] = asdict(collect.mixing)
     if collect.strategy == "nearest":
@@ -258,22 +272,23 @@ def _check_steps(student: Student, teacher: Teacher | None, demonstrations: Demo
     n_steps, representation = executed_steps(student.config, teacher), student.representation
     if representation is None:
         return
+    flag = f"--policy.representation.type={student.config.representation.type}"
     require(
         n_steps == representation.n_steps,
-        f"--policy.representation.type=state predicts {representation.n_steps} steps ahead, and rounds execute "
+        f"{flag} predicts {representation.n_steps} steps ahead, and rounds execute "
         f"{n_steps} (the teacher's own number); set --policy.collect.n_action_steps={n_steps}",
     )
     longest = int(demonstrations.table.lengths.max())
     require(
         longest > n_steps,
-        f"--policy.representation.type=state predicts {n_steps} steps ahead, and no demonstration is longer than "
+        f"{flag} predicts {n_steps} steps ahead, and no demonstration is longer than "
         f"{longest}; set --policy.collect.n_action_steps below that",
     )
     collect = student.config.collect
     require(
         not (collect.strategy == "mixing" and collect.mixing.record_teacher),
         "--policy.collect.mixing.record_teacher=true records actions that were not executed, and "
-        "--policy.representation.type=state learns what recorded actions lead to; use --policy.replay.relabel=all",
+        f"{flag} learns what recorded actions lead to; use --policy.replay.relabel=all",
     )
 
 

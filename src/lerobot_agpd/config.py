@@ -32,7 +32,7 @@ COLLECTION_SEEDS = (1_000_000, 2**31 - 1)
 NoiseScheduler = Literal["DDPM", "DDIM"]
 GuidancePoint = Literal["x0", "mu"]
 StrengthUnit = Literal["pull", "scale"]
-RepresentationType = Literal["action", "state"]
+RepresentationType = Literal["action", "state", "visual"]
 StrategyName = Literal["guided", "nearest", "teacher", "mixing", "rollin"]
 MixingForm = Literal["interpolate", "switch"]
 Relabel = Literal["none", "demonstrations", "all"]
@@ -166,8 +166,11 @@ class GuidanceConfig:
 class RepresentationConfig:
     """In which space the discrepancy J compares two chunks (appendix A.4)."""
 
-    # action: the chunks themselves; state: the future observations that a learned model predicts for them.
+    # action: the chunks themselves; state, visual: the future low-dimensional observations, or features of camera images,
+    # that a learned model predicts for them.
     type: RepresentationType = "action"
+    # type=visual: whose features. A frozen DINOv2 of transformers, Hub repository or folder, or student: the student's own.
+    encoder: str = "facebook/dinov2-small"
 
 
 @dataclass

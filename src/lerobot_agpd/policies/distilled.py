@@ -17,11 +17,11 @@ from torch import Tensor, nn
 from lerobot_agpd.adversary import Discriminator
 from lerobot_agpd.agpd import AGPD
 from lerobot_agpd.build import build_parts
-from lerobot_agpd.config import StudentConfig, require
 from lerobot_agpd.continuation import how_to_continue
-from lerobot_agpd.guidance.representation import LR, StateRepresentation
+from lerobot_agpd.guidance.representation import LR
 from lerobot_agpd.interrupts import InterruptMessage
 from lerobot_agpd.policies.gradient_norms import GradientNorms
+from lerobot_agpd.policies.representations import make_representation
 from lerobot_agpd.replay.demonstrations import delivers_single_frames
 from lerobot_agpd.replay.export import merge
 from lerobot_agpd.replay.normalization import Statistics
@@ -70,10 +70,7 @@ class DistilledPolicy(Student):
         self.discriminator = None
         if config.adversary.weight > 0:
             self.discriminator = Discriminator(config.future_steps, action_dim, self.embedding_dim)
-        self.representation = None
-        if config.representation.type == "state":
-            n_steps = config.collect.n_action_steps or config.n_execute
-            self.representation = StateRepresentation(vector_dim(config), action_dim, n_steps)
+        self.representation, self.visual_encoder = make_representation(self)
         self._gradient_norms = GradientNorms(self.parameter_groups())
         self._last_norms: dict[str, float] = {}
         is_lerobots, run = run is None, run or RunInfo.of(config)
@@ -225,21 +222,6 @@ class DistilledPolicy(Student):
     def _load_as_safetensor(cls, model: Any, model_file: str, map_location: str, strict: bool) -> Any:
         require_weights(model, model_file, optional=cls.optional_weights)
         return super()._load_as_safetensor(model, model_file, map_location, strict)  # type: ignore[misc]
-
-
-def vector_dim(config: StudentConfig) -> int:
-    """Size D of all low-dimensional observations side by side.
-
-    Raises:
-        FlagError: if there are none.
-    """
-    features = config.input_features or {}
-    require(
-        bool(config.observed_vectors),
-        "--policy.representation.type=state predicts low-dimensional observations, but the inputs are "
-        f"{list(features)}; use --policy.representation.type=action",
-    )
-    return sum(features[key].shape[0] for key in config.observed_vectors)
 
 
 def _as_groups(params: Iterable[Any]) -> list[dict[str, Any]]:

@@ -13,6 +13,7 @@ from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_agpd.replay.demonstrations import Batch, DemonstrationFrames
+from lerobot_agpd.replay.frame_features import FrameFeatures
 from lerobot_agpd.replay.frames import ChunkStarts
 from lerobot_agpd.replay.gate import FarValues
 from lerobot_agpd.replay.images import RecordedFrames, as_floats
@@ -208,12 +209,22 @@ class Replay:
 
     def executed_future(self, frame_index: Tensor, keys: Sequence[str], n_steps: int) -> ExecutedFuture:
         """What the representation learns from, for frames (B,) and vectors `keys`."""
-        gather = self.demonstrations.gather
-        actions, _ = gather(ACTION, frame_index, torch.arange(n_steps))
-        observed = [gather(key, frame_index, torch.tensor([0, n_steps])) for key in keys]
-        now, later = (torch.cat([values[:, step] for values, _ in observed], dim=1) for step in (0, 1))
-        _, is_pad = observed[-1]
-        return ExecutedFuture(now, actions, later, is_pad[:, 1])
+        observed = [
+            self.demonstrations.gather(key, frame_index, torch.tensor([0, n_steps]))[0] for key in keys
+        ]
+        now, later = (torch.cat([values[:, step] for values in observed], dim=1) for step in (0, 1))
+        return ExecutedFuture(now, *self._executed(frame_index, n_steps, later))
+
+    def visual_future(self, frame_index: Tensor, features: FrameFeatures, n_steps: int) -> ExecutedFuture:
+        """The same with the features of camera frames."""
+        index = frame_index.cpu()
+        _, ends = self.table.episode_bounds(index)
+        later = features.at(torch.minimum(index + n_steps, ends - 1))
+        return ExecutedFuture(features.at(index), *self._executed(frame_index, n_steps, later))
+
+    def _executed(self, frame_index: Tensor, n_steps: int, later: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        actions, is_pad = self.demonstrations.gather(ACTION, frame_index, torch.arange(n_steps + 1))
+        return actions[:, :n_steps], later, is_pad[:, n_steps]
 
 
 def _column(episode: StoredEpisode, key: str) -> Tensor:

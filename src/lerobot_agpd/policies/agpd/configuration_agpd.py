@@ -33,7 +33,7 @@ class AGPDConfig(ACTConfig, StudentConfig):
     # scratch, so they take optimizer_lr in the place of optimizer_lr_backbone.
     encoder: EncoderName = "resnet"
     # encoder=small: largest random shift of training images, pixels; 0: none.
-    encoder_shift: int = 4
+    encoder_shift: int = 2
     # Learning rate schedule, e.g. cosine; default: constant, as LeRobot trains ACT.
     scheduler_name: str | None = None
     # Steps over which a scheduled learning rate rises.

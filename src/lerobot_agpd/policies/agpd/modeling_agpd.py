@@ -4,12 +4,14 @@ import logging
 from collections.abc import Mapping
 from typing import Any
 
+import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.utils.constants import OBS_IMAGES
 from torch import Tensor, nn
 
+from lerobot_agpd.guidance.visual import pooled
 from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig
 from lerobot_agpd.policies.distilled import DistilledPolicy
 from lerobot_agpd.policies.encoders import GroupNormResNet, SmallEncoder
@@ -90,3 +92,8 @@ class AGPDPolicy(DistilledPolicy, ACTPolicy):  # type: ignore[misc]
             self.model.train(was_training)
             hook.remove()
         return PriorChunk(chunk, tokens[0].mean(dim=0))
+
+    def image_tokens(self, images: Mapping[str, Tensor]) -> Tensor:
+        """The feature maps of ACT's backbone for the cameras' normalized images (B, C, H, W), one token per place."""
+        maps = (self.model.backbone(images[key])["feature_map"] for key in self.config.image_features)
+        return torch.cat([pooled(each) for each in maps], dim=1)
