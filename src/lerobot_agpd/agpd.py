@@ -187,6 +187,7 @@ class AGPD:
         self.config = student.config
         self.run, self.progress = parts.run, parts.progress
         self.replay, self.teacher_chunks = parts.replay, parts.teacher_chunks
+        self.frame_features = parts.frame_features
         self.teacher, self.self_teacher = parts.teacher, parts.self_teacher
         self.collector, self.journal = parts.collector, parts.journal
         self.seed, self.rank = parts.seed, parts.rank
@@ -367,10 +368,12 @@ class AGPD:
                 ADVERSARY_LOG, (terms.loss.item(), terms.log_d.item(), terms.accuracy.item()), strict=True
             )
         if self.student.representation is not None:
-            representation = self.student.representation
-            future = self.replay.executed_future(
-                batch[FRAME_INDEX], self.config.observed_vectors, representation.n_steps
-            )
+            representation, frames = self.student.representation, batch[FRAME_INDEX]
+            if self.frame_features is None:
+                keys = self.config.observed_vectors
+                future = self.replay.executed_future(frames, keys, representation.n_steps)
+            else:
+                future = self.replay.visual_future(frames, self.frame_features, representation.n_steps)
             predicted = representation(future.observation, future.actions)  # O_hat_{t+n}
             recon = reconstruction_loss(predicted, future.later, future.is_pad)
             total = total + WEIGHT * recon

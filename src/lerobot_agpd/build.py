@@ -16,16 +16,18 @@ from lerobot_agpd.config import StudentConfig, require
 from lerobot_agpd.continuation import damaged_file, how_to_continue
 from lerobot_agpd.guidance.strength import STEPS_FLAG, first_strength, require_strength
 from lerobot_agpd.guidance.teacher import Teacher
-from lerobot_agpd.loading import check_fit, collection_environment, load_teacher
+from lerobot_agpd.loading import check_fit, collection_environment, load_teacher, vectors
 from lerobot_agpd.progress import REPLAY_FOLDER, Progress, find_replay_root
 from lerobot_agpd.replay.chunk_store import FOLDER, ChunkStore
 from lerobot_agpd.replay.demonstrations import DemonstrationFrames
 from lerobot_agpd.replay.export import check_observation
+from lerobot_agpd.replay.frame_features import FrameFeatures
 from lerobot_agpd.replay.journal import EpisodeJournal
 from lerobot_agpd.replay.normalization import Statistics
 from lerobot_agpd.replay.replay import Replay
 from lerobot_agpd.replay.teacher_chunks import TeacherChunks
 from lerobot_agpd.rollout.collector import Collector
+from lerobot_agpd.rollout.first_observation import first_observation
 from lerobot_agpd.rollout.report import RoundReport, read_reports
 from lerobot_agpd.run import RunInfo
 from lerobot_agpd.self_distillation import SelfTeacher
@@ -42,6 +44,8 @@ class Parts:
         run: the training run.
         progress: counters, restored if the run continues a checkpoint.
         replay: T.
+        frame_features: what the representation predicts of T's camera frames; None where it predicts vectors, or there is
+            none.
         teacher: None without one, and in self-distillation.
         self_teacher: in self-distillation.
         teacher_chunks: the teacher's chunks on T; None if neither adversary nor relabeling uses them.
@@ -55,6 +59,7 @@ class Parts:
     run: RunInfo
     progress: Progress
     replay: Replay
+    frame_features: FrameFeatures | None
     teacher: Teacher | None
     self_teacher: SelfTeacher | None
     teacher_chunks: TeacherChunks | None
@@ -93,14 +98,15 @@ def build_parts(
     )
     progress = Progress.restore(config, run)
     _require_intact(progress)
-    demonstrations = DemonstrationFrames(config, dataset_meta, dataset_stats)
-    meta = demonstrations.dataset.meta
-    replay = Replay(demonstrations, config, config.replay.collected_fraction, run.image_transforms)
-    replay.see(progress.seen_episodes)
     self_teacher = _self_teacher(student, progress)
     teacher = None if self_teacher else _teacher(config)
     env_config = collection_environment(config.collect, run) if config.collect.enabled else None
-    check_fit(config, teacher, meta, env_config)
+    check_fit(config, teacher, dataset_meta, env_config)
+    seen_by_teacher = vectors(teacher.input_features) if teacher else []
+    demonstrations = DemonstrationFrames(config, dataset_meta, dataset_stats, seen_by_teacher)
+    meta = demonstrations.dataset.meta
+    replay = Replay(demonstrations, config, config.replay.collected_fraction, run.image_transforms)
+    replay.see(progress.seen_episodes)
     collector, journal = None, None
     root = _root(config, run, progress)
     if env_config is not None:
@@ -109,12 +115,17 @@ def build_parts(
         _warn_of_settings(config)
         journal = _journal(config, root, progress, meta, env_config, seed)
         check = partial(check_observation, meta.features)
+        if config.image_features or (teacher and len(seen_by_teacher) < len(teacher.input_features)):
+            check(
+                first_observation(env_config, config)
+            )  # environments declare sizes that they do not always deliver
         rank, n_ranks = processes.process_index, processes.num_processes
         collector = Collector(config, env_config, meta, journal, check, seed, rank, n_ranks)
     return Parts(
         run=run,
         progress=progress,
         replay=replay,
+        frame_features=_frame_features(student, replay),
         teacher=teacher,
         self_teacher=self_teacher,
         teacher_chunks=_teacher_chunks(config, teacher, replay, seed, root),
@@ -142,6 +153,13 @@ def _require_intact(progress: Progress) -> None:
             f"{damaged} is damaged; restore it, or continue from another checkpoint: "
             f"{how_to_continue(run_folder, run_folder / REPLAY_FOLDER)}"
         )
+
+
+def _frame_features(student: Student, replay: Replay) -> FrameFeatures | None:
+    encoder, config = student.visual_encoder, student.config
+    if encoder is None:
+        return None
+    return FrameFeatures(replay.frames, list(config.image_features), encoder, replay.demonstrations)
 
 
 # ---- teacher ----
@@ -266,6 +284,8 @@ def _identity(config: StudentConfig, env_config: EnvConfig, seed: int) -> dict[s
         identity |= {f"guidance.{name}": value for name, value in asdict(config.guidance).items()}
     if collect.guides or collect.strategy == "nearest":
         identity["representation.type"] = config.representation.type
+        if config.representation.type == "visual":
+            identity["representation.encoder"] = config.representation.encoder
     if collect.strategy == "mixing":
         identity["collect.mixing"] = asdict(collect.mixing)
     if collect.strategy == "nearest":
@@ -300,22 +320,23 @@ def _check_steps(student: Student, teacher: Teacher | None, demonstrations: Demo
     n_steps, representation = executed_steps(student.config, teacher), student.representation
     if representation is None:
         return
+    flag = f"--policy.representation.type={student.config.representation.type}"
     require(
         n_steps == representation.n_steps,
-        f"--policy.representation.type=state predicts {representation.n_steps} steps ahead, and rounds execute "
+        f"{flag} predicts {representation.n_steps} steps ahead, and rounds execute "
         f"{n_steps} (the teacher's own number); set --policy.collect.n_action_steps={n_steps}",
     )
     longest = int(demonstrations.table.lengths.max())
     require(
         longest > n_steps,
-        f"--policy.representation.type=state predicts {n_steps} steps ahead, and no demonstration is longer than "
+        f"{flag} predicts {n_steps} steps ahead, and no demonstration is longer than "
         f"{longest}; set --policy.collect.n_action_steps below that",
     )
     collect = student.config.collect
     require(
         not (collect.strategy == "mixing" and collect.mixing.record_teacher),
         "--policy.collect.mixing.record_teacher=true records actions that were not executed, and "
-        "--policy.representation.type=state learns what recorded actions lead to; use --policy.replay.relabel=all",
+        f"{flag} learns what recorded actions lead to; use --policy.replay.relabel=all",
     )
 
 

@@ -32,7 +32,7 @@ COLLECTION_SEEDS = (1_000_000, 2**31 - 1)
 NoiseScheduler = Literal["DDPM", "DDIM"]
 GuidancePoint = Literal["x0", "mu"]
 StrengthUnit = Literal["pull", "scale"]
-RepresentationType = Literal["action", "state"]
+RepresentationType = Literal["action", "state", "visual"]
 StrategyName = Literal["guided", "nearest", "teacher", "mixing", "rollin"]
 MixingForm = Literal["interpolate", "switch"]
 Relabel = Literal["none", "demonstrations", "all"]
@@ -166,8 +166,11 @@ class GuidanceConfig:
 class RepresentationConfig:
     """In which space the discrepancy J compares two chunks (appendix A.4)."""
 
-    # action: the chunks themselves; state: the future observations that a learned model predicts for them.
+    # action: the chunks themselves; state, visual: the future low-dimensional observations, or features of camera images,
+    # that a learned model predicts for them.
     type: RepresentationType = "action"
+    # type=visual: whose features. A frozen DINOv2 of transformers, Hub repository or folder, or student: the student's own.
+    encoder: str = "facebook/dinov2-small"
 
 
 @dataclass
@@ -337,6 +340,26 @@ class StudentConfig(PreTrainedConfig):
     collect: CollectConfig = field(default_factory=CollectConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     adversary: AdversaryConfig = field(default_factory=AdversaryConfig)
+    # Features of the demonstrations that the student sees, e.g. "[observation.state,observation.image]"; default: all.
+    # The teacher sees what it was trained on, whatever the student sees.
+    inputs: list[str] | None = None
+
+    def select_inputs(self) -> None:
+        """Leave of `input_features`, which LeRobot fills with all of a dataset's, those that `inputs` names.
+
+        Raises:
+            FlagError: if one of them does not exist.
+        """
+        if self.inputs is None:
+            return
+        available = self.input_features or {}
+        missing = sorted(set(self.inputs) - set(available))
+        require(
+            not missing,
+            f"--policy.inputs={self.inputs}: {missing} is not among the features of the demonstrations "
+            f"(--dataset.*), which hold {sorted(available)}",
+        )
+        self.input_features = {key: available[key] for key in available if key in self.inputs}
 
     @property
     @abstractmethod

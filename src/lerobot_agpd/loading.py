@@ -274,6 +274,11 @@ def demonstrated_features(dataset_meta: LeRobotDatasetMetadata) -> Features:
     return {key: feature for key, feature in features.items() if key.startswith(OBS_PREFIX)}
 
 
+def vectors(features: Features) -> list[str]:
+    """Names of the low-dimensional observations among features."""
+    return [key for key, ft in features.items() if ft.type in (FeatureType.STATE, FeatureType.ENV)]
+
+
 def _action(student: StudentConfig) -> PolicyFeature:
     assert student.action_feature is not None
     return student.action_feature
@@ -285,21 +290,25 @@ def _check_environment(student: StudentConfig, teacher: Teacher | None, env_conf
     observers: dict[str, Features] = {"student": student.input_features or {}}
     if teacher is not None:
         observers["teacher"] = teacher.input_features
-    for observer, needed in observers.items():
-        missing = sorted(set(needed) - set(delivered))
+    for observer, inputs in observers.items():
+        missing = sorted(set(inputs) - set(delivered))
         require(
             not missing,
-            f"the {observer} observes {sorted(needed)}, the environment '{env_config.type}' delivers "
+            f"the {observer} observes {sorted(inputs)}, the environment '{env_config.type}' delivers "
             f"{sorted(set(delivered) - {ACTION})}: {missing} is missing (check --env.obs_type and --dataset.*)",
         )
-    for key, feature in {**observers["student"], ACTION: _action(student)}.items():
-        # Images are left out: environments declare sizes that they do not always deliver.
-        demonstrated, given = tuple(feature.shape), tuple(delivered[key].shape)
-        require(
-            feature.type is FeatureType.VISUAL or demonstrated == given,
-            f"'{key}' has shape {demonstrated} in the demonstrations (--dataset.*) and {given} in the environment "
-            f"'{env_config.type}' (--env.*, task {env_config.task})",
-        )
+    sources = {"the demonstrations (--dataset.*)": {**observers["student"], ACTION: _action(student)}}
+    if teacher is not None:
+        sources["the teacher (--policy.teacher.path)"] = teacher.input_features
+    for source, features in sources.items():
+        for key in [*vectors(features), *([ACTION] if ACTION in features else [])]:
+            # Images are left out: environments declare sizes that they do not always deliver.
+            needed, given = tuple(features[key].shape), tuple(delivered[key].shape)
+            require(
+                needed == given,
+                f"'{key}' has shape {needed} in {source} and {given} in the environment '{env_config.type}' (--env.*, "
+                f"task {env_config.task})",
+            )
 
 
 def _check_observations(teacher: Teacher, source: str, available: Features) -> None:

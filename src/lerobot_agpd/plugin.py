@@ -23,6 +23,7 @@ ENV_TYPES = {
     "fetch_ways": "lerobot_agpd.envs.fetch_ways",
     "gymnasium_robotics": "lerobot_agpd.envs.gymnasium_robotics",
     "point_maze_ways": "lerobot_agpd.envs.point_maze",
+    "pusht_state": "lerobot_agpd.envs.pusht",
     "robosuite_robomimic": "lerobot_agpd.envs.robomimic",
     "robosuite_ways": "lerobot_agpd.envs.robosuite_ways",
 }

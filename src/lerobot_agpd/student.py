@@ -13,11 +13,12 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 
-from lerobot_agpd.config import StudentConfig, require
+from lerobot_agpd.config import FlagError, StudentConfig, require
 from lerobot_agpd.guidance.discrepancy import ActionDiscrepancy, StateDiscrepancy
 from lerobot_agpd.guidance.representation import StateRepresentation
 from lerobot_agpd.guidance.teacher import History, Teacher
 from lerobot_agpd.guidance.teacher_student import TeacherStudent
+from lerobot_agpd.guidance.visual import VisualEncoder
 from lerobot_agpd.replay.normalization import Normalizer
 
 
@@ -40,11 +41,13 @@ class Student(nn.Module):
     Attributes:
         config: its configuration.
         representation: predicts future observations for J (A.4); None where J compares the chunks themselves.
+        visual_encoder: makes what it predicts of camera images; None where it predicts low-dimensional observations.
         can_teach_itself: whether `snapshot` is implemented.
     """
 
     config: StudentConfig
     representation: StateRepresentation | None
+    visual_encoder: VisualEncoder | None = None
     can_teach_itself = False
 
     if TYPE_CHECKING:
@@ -66,6 +69,13 @@ class Student(nn.Module):
         recorded actions (ACT in training mode does). A policy that denoises returns the clean chunk that one
         denoising step estimates, so that nothing is backpropagated through its sampling.
         """
+
+    def image_tokens(self, images: Mapping[str, Tensor]) -> Tensor:
+        """The student's own features (B, N, F) of the cameras' normalized images (B, C, H, W)."""
+        raise FlagError(
+            f"--policy.representation.encoder=student: a '{self.config.type}' student has no image features to offer; "
+            "name a DINOv2"
+        )
 
     def snapshot(self) -> PreTrainedPolicy:
         """A frozen copy of the policy as it would be evaluated now, without what only trains it."""
@@ -122,16 +132,23 @@ class StudentSampler:
     ) -> StateDiscrepancy:
         """J between the futures that the student's representation predicts (A.4)."""
         assert self.student.representation is not None
-        vectors = [
-            self.normalizer.normalize(key, history[key][:, -1]) for key in self.config.observed_vectors
-        ]
         return StateDiscrepancy(
             representation=self.student.representation,
-            observation=torch.cat(vectors, dim=1).to(chunk_hat.device),
+            observation=self._observation(history).to(chunk_hat.device),
             target=chunk_hat[:, : pair.n_steps],
             to_student=pair.teacher_in_student_space,
             reference=action_j,
         )
+
+    def _observation(self, history: History) -> Tensor:
+        """What the representation is given of the present, (B, D)."""
+        if self.student.visual_encoder is not None:
+            images = {key: history[key][:, -1] for key in self.config.image_features}
+            return self.student.visual_encoder.encode(images, self.normalizer.normalize)
+        vectors = (
+            self.normalizer.normalize(key, history[key][:, -1]) for key in self.config.observed_vectors
+        )
+        return torch.cat(list(vectors), dim=1)
 
 
 def executed_steps(config: StudentConfig, teacher: Teacher | None) -> int:

@@ -15,21 +15,32 @@ from lerobot.envs.utils import check_env_attributes_and_types, env_to_policy_fea
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_agpd.config import FlagError
-from lerobot_agpd.envs import aloha, fetch_ways, gymnasium_robotics, point_maze, robomimic, robosuite_ways
+from lerobot_agpd.envs import (
+    aloha,
+    fetch_ways,
+    gymnasium_robotics,
+    point_maze,
+    pusht,
+    robomimic,
+    robosuite_ways,
+)
 from lerobot_agpd.envs.aloha import AlohaStateEnvConfig
 from lerobot_agpd.envs.base import ENVIRONMENT_STATE
 from lerobot_agpd.envs.fetch_ways import FetchWaysEnv
 from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
 from lerobot_agpd.envs.point_maze import PointMazeWaysEnv
+from lerobot_agpd.envs.pusht import PushTStateEnvConfig
 from lerobot_agpd.envs.robomimic import RobomimicEnvConfig
 from lerobot_agpd.envs.robosuite_ways import RobosuiteWaysEnv
 
 KITCHEN = "FrankaKitchen-v1"
+EVERYTHING = "pixels_environment_state_agent_pos"
 MODULES = {
     AlohaStateEnvConfig: (aloha, "gym_aloha", "aloha"),
     FetchWaysEnv: (fetch_ways, "gymnasium_robotics", "fetch"),
     GymnasiumRoboticsEnv: (gymnasium_robotics, "gymnasium_robotics", "fetch"),
     PointMazeWaysEnv: (point_maze, "gymnasium_robotics", "fetch"),
+    PushTStateEnvConfig: (pusht, "gym_pusht", "pusht"),
     RobomimicEnvConfig: (robomimic, "robosuite", "robomimic"),
     RobosuiteWaysEnv: (robosuite_ways, "robosuite", "robomimic"),
 }
@@ -38,6 +49,7 @@ MODULES = {
 QUICK = [
     (AlohaStateEnvConfig, "AlohaTransferCube-v0"),
     (AlohaStateEnvConfig, "AlohaInsertion-v0"),
+    (PushTStateEnvConfig, "PushT-v0"),
     *((FetchWaysEnv, task) for task in fetch_ways.TASKS),
     *((GymnasiumRoboticsEnv, task) for task in gymnasium_robotics.TASKS),
     *((PointMazeWaysEnv, task) for task in point_maze.TASKS),
@@ -176,6 +188,39 @@ def test_defaults_follow_the_task(config, episode_length, cameras):
     assert all(features[key].shape == (3, 24, pixels.observation_width) for key in images)
 
 
+@pytest.mark.parametrize(
+    "config",
+    [
+        GymnasiumRoboticsEnv(obs_type=EVERYTHING, cameras=["front", "side"], antialiasing=False),
+        FetchWaysEnv(obs_type=EVERYTHING),
+        PushTStateEnvConfig(obs_type=EVERYTHING),
+        *(
+            pytest.param(
+                kind(obs_type=EVERYTHING, observation_height=24, shadows=False), marks=pytest.mark.slow
+            )
+            for kind in (AlohaStateEnvConfig, PointMazeWaysEnv, RobomimicEnvConfig, RobosuiteWaysEnv)
+        ),
+    ],
+    ids=lambda config: config.type,
+)
+def test_cameras_and_environment_state_at_once(rendering, config):
+    env = make_vector_env(config, n_envs=1)
+    observation, _ = env.reset(seed=[3])
+    batch, features = preprocess_observation(observation), env_to_policy_features(config)
+    assert {key: tuple(value.shape[1:]) for key, value in batch.items()} == {
+        key: feature.shape for key, feature in features.items() if key != ACTION
+    }
+    images = [key for key, value in batch.items() if value.ndim == 4]
+    assert images and all(batch[key].std() > 0.01 for key in images)
+    env.close()
+    # What cameras see changes nothing in the state.
+    blind = "environment_state_agent_pos" if "state" not in config.obs_types else "state"
+    env = make_vector_env(type(config)(task=config.task, obs_type=blind), n_envs=1)
+    expected, _ = env.reset(seed=[3])
+    np.testing.assert_array_equal(observation[ENVIRONMENT_STATE], expected[ENVIRONMENT_STATE])
+    env.close()
+
+
 @every_type
 @pytest.mark.parametrize(
     ("options", "message"),
@@ -199,10 +244,16 @@ def test_what_no_type_can_do_is_refused(kind, options, message):
     ("kind", "options", "message"),
     [
         (AlohaStateEnvConfig, {"obs_type": "state"}, "--env.obs_type=state .*environment_state_agent_pos"),
+        (PushTStateEnvConfig, {"obs_type": "state"}, "--env.obs_type=state .*environment_state_agent_pos"),
         (AlohaStateEnvConfig, {"cameras": ["behind"]}, "--env.cameras=.*behind.* top"),
         (AlohaStateEnvConfig, {"cameras": []}, "--env.cameras="),
         (RobomimicEnvConfig, {"cameras": ["shouldercamera0"]}, "--env.cameras=.*shouldercamera0.* agentview"),
         (RobomimicEnvConfig, {"cameras": []}, "--env.cameras="),
+        (FetchWaysEnv, {"cameras": ["top"]}, "--env.cameras=.*top.* front"),
+        (GymnasiumRoboticsEnv, {"task": KITCHEN, "cameras": ["front"]}, "--env.cameras=.*FrankaKitchen-v1"),
+        (GymnasiumRoboticsEnv, {"task": KITCHEN, "camera_distance": 1.0}, "--env.camera_.*FrankaKitchen-v1 is fixed"),
+        (GymnasiumRoboticsEnv, {"camera_distance": 0.0}, "--env.camera_distance must be positive"),
+        (GymnasiumRoboticsEnv, {"camera_lookat": [1.0, 2.0]}, "--env.camera_lookat=.*three numbers"),
         (GymnasiumRoboticsEnv, {"tasks_to_complete": ["kettle"]}, "--env.tasks_to_complete=.*FetchPickAndPlace-v4"),
         (GymnasiumRoboticsEnv, {"task": KITCHEN, "tasks_to_complete": ["iron"]}, "iron.*bottom burner"),
         (GymnasiumRoboticsEnv, {"task": KITCHEN, "tasks_to_complete": []}, "--env.tasks_to_complete="),

@@ -69,6 +69,12 @@ def as_plain(policy: PreTrainedPolicy) -> PreTrainedPolicy:
     """
     config: Any = policy.config
     if isinstance(config, AGPDConfig):
+        if config.image_features and config.encoder != "resnet":
+            raise ValueError(
+                f"--checkpoint has the image encoder '{config.encoder}' (--policy.encoder), which LeRobot's 'act' does not "
+                "have: it runs wherever this plugin is installed; to export a student with cameras, train it with "
+                "--policy.encoder=resnet"
+            )
         return _as(ACTPolicy, ACTConfig, "model.", policy)
     if isinstance(config, DiffusionTransformerConfig) and config.denoiser == "unet":
         return _as(DiffusionPolicy, DiffusionConfig, "diffusion.", policy)

@@ -24,7 +24,7 @@ FPS = 10
 TASK = DESCRIPTIONS["gym_pusht/PushT-v0"]
 SUCCESS_COVERAGE = 0.95
 
-Variant = Literal["keypoints", "state", "image"]
+Variant = Literal["keypoints", "state", "image", "image_keypoints"]
 
 
 @dataclass
@@ -37,7 +37,8 @@ class ImportPushTConfig:
     root: Path
     # Name of the new dataset.
     repo_id: str = "local/pusht_keypoints"
-    # Observation beside the agent's position: the block's corners (keypoints) or pose (state), or a 96x96 image.
+    # Observation beside the agent's position: the block's corners (keypoints) or pose (state), a 96x96 image, or image
+    # and corners.
     variant: Variant = "keypoints"
     # Episodes to keep, e.g. "[0,1,2]"; default: all.
     episodes: list[int] | None = None
@@ -78,6 +79,7 @@ def dataset_features(variant: Variant) -> dict[str, dict[str, Any]]:
         "keypoints": {OBS_ENV_STATE: vector(16)},
         "state": {OBS_ENV_STATE: vector(3)},
         "image": {OBS_IMAGE: image(IMAGE_SHAPE)},
+        "image_keypoints": {OBS_IMAGE: image(IMAGE_SHAPE), OBS_ENV_STATE: vector(16)},
     }
     return {
         OBS_STATE: vector(2),
@@ -110,10 +112,10 @@ def episode_frames(arrays: Arrays, rows: slice, variant: Variant) -> Iterator[Fr
         SUCCESS: next_coverage > SUCCESS_COVERAGE,
         DONE: np.arange(1, len(state) + 1)[:, None] == len(state),
     }
-    if variant == "image":
+    if "image" in variant:
         columns[OBS_IMAGE] = arrays["img"][rows]
-    else:
-        columns[OBS_ENV_STATE] = corners if variant == "keypoints" else state[:, 2:5].astype(np.float32)
+    if variant != "image":
+        columns[OBS_ENV_STATE] = state[:, 2:5].astype(np.float32) if variant == "state" else corners
     for step in range(len(state)):
         yield {**{key: values[step] for key, values in columns.items()}, "task": TASK}
 
@@ -124,7 +126,7 @@ def import_pusht(config: ImportPushTConfig) -> LeRobotDataset:
     Raises:
         ValueError: if the source does not have a requested episode; see also `load_arrays`.
     """
-    arrays = load_arrays(config.source, with_images=config.variant == "image", images=config.images)
+    arrays = load_arrays(config.source, with_images="image" in config.variant, images=config.images)
     bounds = [0, *arrays["episode_ends"].tolist()]
     n_episodes = len(bounds) - 1
     episodes = config.episodes or range(config.first_episodes or n_episodes)

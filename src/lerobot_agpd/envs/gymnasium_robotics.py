@@ -4,26 +4,29 @@ Observations are split into LeRobot's raw keys:
 
 - `agent_pos`: joints and gripper of the robot (becomes `observation.state`);
 - `environment_state`: objects and, where there is one, the desired goal (becomes `observation.environment_state`);
-- `pixels`: one camera image (becomes `observation.image`).
+- `pixels`: one camera image (becomes `observation.image`), or several (`observation.images.<camera>`).
 
 The tasks are in `robotics_tasks`, the wrapper in `robotics_wrapper`.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import gymnasium as gym
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_agpd.config import require
-from lerobot_agpd.envs.base import SimulatedEnvConfig, require_choice
+from lerobot_agpd.envs.base import require_choice
+from lerobot_agpd.envs.free_camera import FreeCameraEnvConfig
 from lerobot_agpd.envs.packages import require_packages
+from lerobot_agpd.envs.poses import CameraPose
 from lerobot_agpd.envs.robotics_tasks import KITCHEN, KITCHEN_DEFAULT, KITCHEN_TASKS, TASKS
 
 
 @EnvConfig.register_subclass("gymnasium_robotics")
 @dataclass
-class GymnasiumRoboticsEnv(SimulatedEnvConfig):
-    """Tasks of Gymnasium-Robotics, seen through their state or one camera."""
+class GymnasiumRoboticsEnv(FreeCameraEnvConfig):
+    """Tasks of Gymnasium-Robotics, seen through their state or cameras."""
 
     tasks = TASKS
 
@@ -45,6 +48,16 @@ class GymnasiumRoboticsEnv(SimulatedEnvConfig):
         )
         if self.tasks_to_complete is not None:
             require_choice("tasks_to_complete", self.tasks_to_complete, KITCHEN_TASKS)
+
+    @property
+    def task_pose(self) -> CameraPose | None:
+        """Pose of the task's main camera."""
+        return TASKS[str(self.task)].pose
+
+    @property
+    def task_poses(self) -> Mapping[str, CameraPose]:
+        """Poses of the task's named cameras."""
+        return TASKS[str(self.task)].poses
 
     def make_single(self) -> gym.Env:
         """Build one wrapped environment; see `SimulatedEnvConfig.make_single`."""

@@ -14,9 +14,18 @@ import mujoco
 import numpy as np
 
 from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS, TaskSpec, View
+from lerobot_agpd.envs.poses import CameraPose
 
 type Camera = mujoco.MjvCamera | int | str
 """A camera, or the number or name of one of the model's."""
+
+
+def free_camera(pose: CameraPose) -> mujoco.MjvCamera:
+    """Camera at a pose."""
+    camera = mujoco.MjvCamera()
+    camera.distance, camera.azimuth, camera.elevation = pose.distance, pose.azimuth, pose.elevation
+    camera.lookat[:] = pose.lookat
+    return camera
 
 
 class SceneRenderer:
@@ -26,14 +35,15 @@ class SceneRenderer:
         renderers: one per size of image that has been rendered, with a graphics context each.
     """
 
-    def __init__(self, shadows: bool, hidden_group: int | None) -> None:
+    def __init__(self, shadows: bool, hidden_group: int | None, antialiasing: bool = True) -> None:
         """Open no graphics context yet.
 
         Args:
             shadows: whether to draw shadows.
             hidden_group: group of geometry that is not drawn.
+            antialiasing: whether to draw smooth edges.
         """
-        self._shadows = shadows
+        self._shadows, self._antialiasing = shadows, antialiasing
         self._option = mujoco.MjvOption()
         if hidden_group is not None:
             self._option.geomgroup[hidden_group] = 0
@@ -56,6 +66,8 @@ class SceneRenderer:
         if size not in self.renderers:
             buffer = model.vis.global_
             buffer.offheight, buffer.offwidth = max(buffer.offheight, size[0]), max(buffer.offwidth, size[1])
+            if not self._antialiasing:
+                model.vis.quality.offsamples = 0  # read when a context is opened
             self.renderers[size] = mujoco.Renderer(model, *size)
             self.renderers[size].scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._shadows
         renderer = self.renderers[size]
@@ -76,6 +88,7 @@ class ViewedEnv(gym.Env):
         view: what is shown.
         state: `agent_pos` and `environment_state` of the last observation, whatever the view shows: for experts.
         main_camera: camera of rendered frames, and of an observed image without a name.
+        cameras: those observed cameras that are not the model's, by name.
         task_description: one sentence, for LeRobot.
         action_names: of the action's dimensions, for pictures; empty: they have none.
     """
@@ -83,6 +96,7 @@ class ViewedEnv(gym.Env):
     view: View
     state: dict[str, np.ndarray]
     main_camera: Camera = "top"
+    cameras: dict[str, mujoco.MjvCamera]
     task_description: str
     action_names: Sequence[str] = ()
 
@@ -90,7 +104,10 @@ class ViewedEnv(gym.Env):
         """Declare the observations of a task; `hidden_group` of the model's geometry is in no image."""
         self.view, self.state = view, {}
         self.task_description = spec.description
-        self.scene_renderer = SceneRenderer(view.shadows, hidden_group)
+        self.scene_renderer = SceneRenderer(view.shadows, hidden_group, view.antialiasing)
+        self.cameras = {name: free_camera(pose) for name, pose in view.poses.items()}
+        if view.main_pose is not None:
+            self.main_camera = free_camera(view.main_pose)
         image = gym.spaces.Box(0, 255, (*view.observation_size, 3), np.uint8)
         spaces: dict[str, gym.Space] = {
             AGENT_POS: gym.spaces.Box(-np.inf, np.inf, (spec.agent_pos_dim,), np.float32),
@@ -106,7 +123,7 @@ class ViewedEnv(gym.Env):
         observation: dict[str, Any] = {key: self.state[key] for key in self.view.keys if key != PIXELS}
         if PIXELS in self.view.keys:
             size = self.view.observation_size
-            images = {camera: self._image(camera, size) for camera in self.view.cameras}
+            images = {name: self._image(self.cameras.get(name, name), size) for name in self.view.cameras}
             observation[PIXELS] = images or self._image(self.main_camera, size)
         return observation
 

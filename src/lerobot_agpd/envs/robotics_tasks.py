@@ -4,13 +4,14 @@ A new task is one more entry in `TASKS` (which numbers of its observation belong
 and what success means) and in `gymnasium_robotics.Task`.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from lerobot_agpd.envs.base import TaskSpec
+from lerobot_agpd.envs.poses import FETCH_POSE, FETCH_POSES, SLIDE_POSE, SLIDE_POSES, CameraPose
 
 RawObservation = np.ndarray | dict[str, Any]
 Success = Callable[[Any, RawObservation, dict[str, Any]], bool]
@@ -25,12 +26,16 @@ class RoboticsTask(TaskSpec):
         scene: indices that make up `environment_state`.
         success: of the unwrapped environment, the raw observation and the info of a step or a reset.
         goal_dim: length of the desired goal that is appended to `environment_state`; 0 for a task without one.
+        pose: of the main camera; None: the one that the environment renders with.
+        poses: of the named cameras.
     """
 
     agent: Sequence[int]
     scene: Sequence[int]
     success: Success
     goal_dim: int = 0
+    pose: CameraPose | None = None
+    poses: Mapping[str, CameraPose] = field(default_factory=dict)
 
     def split(self, observation: RawObservation) -> tuple[np.ndarray, np.ndarray]:
         """Split one observation into `agent_pos` (agent_pos_dim,) and `environment_state` (environment_state_dim,).
@@ -61,7 +66,13 @@ def _all_tasks_done(env: Any, observation: RawObservation, info: dict[str, Any])
     return set(env.goal) <= set(info["episode_task_completions"])
 
 
-def _fetch(description: str, agent: Sequence[int], scene: Sequence[int]) -> RoboticsTask:
+def _fetch(
+    description: str,
+    agent: Sequence[int],
+    scene: Sequence[int],
+    pose: CameraPose = FETCH_POSE,
+    poses: Mapping[str, CameraPose] = FETCH_POSES,
+) -> RoboticsTask:
     return RoboticsTask(
         description=description,
         fps=25,
@@ -73,6 +84,8 @@ def _fetch(description: str, agent: Sequence[int], scene: Sequence[int]) -> Robo
         scene=scene,
         goal_dim=3,
         success=goal_reached,
+        pose=pose,
+        poses=poses,
     )
 
 
@@ -114,7 +127,9 @@ TASKS: dict[str, RoboticsTask] = {
     "FetchReach-v4": _fetch("Move the gripper to the target position.", *ARM),
     "FetchPush-v4": _fetch("Push the block to the target position on the table.", *ARM_AND_OBJECT),
     "FetchPickAndPlace-v4": _fetch("Pick up the block and bring it to the target position.", *ARM_AND_OBJECT),
-    "FetchSlide-v4": _fetch("Hit the puck so that it slides to the target position.", *ARM_AND_OBJECT),
+    "FetchSlide-v4": _fetch(
+        "Hit the puck so that it slides to the target position.", *ARM_AND_OBJECT, SLIDE_POSE, SLIDE_POSES
+    ),
     # Arm, wrist and finger joints, and the position of the palm where it is observed; relocate observes the palm
     # only from the ball and from the target.
     "AdroitHandDoor-v1": _adroit(

@@ -49,13 +49,27 @@ class RoboticsWrapper(ViewedEnv, gym.Wrapper, gym.utils.RecordConstructorArgs):
         if isinstance(goal, dict):  # the kitchen, whose goal names the tasks
             self.task_description = f"Kitchen: {', '.join(goal)}."
         self._simulation: Any = getattr(env.unwrapped, "robot_env", env.unwrapped)  # the kitchen's robot
-        self.main_camera = configured_camera(self._simulation)
+        self._shown: mujoco.MjData | None = None  # a copy of the simulation's data, as it is drawn
+        if view.main_pose is None:
+            self.main_camera = configured_camera(self._simulation)
 
     def scene(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Model and data of the simulation."""
-        if hasattr(self._simulation, "_render_callback"):
-            self._simulation._render_callback()  # Fetch: puts the target's marker in its place
-        return self._simulation.model, self._simulation.data
+        """Model and data of the simulation, or of a copy."""
+        simulation = self._simulation
+        if not hasattr(simulation, "_render_callback"):
+            return simulation.model, simulation.data
+        # Fetch puts the target's marker in its place with mj_forward, from which the next step's solver would start
+        # elsewhere: an episode would depend on whether it is looked at.
+        if self._shown is None:
+            self._shown = mujoco.MjData(simulation.model)
+        mujoco.mj_copyData(self._shown, simulation.model, simulation.data)
+        mujoco.mj_kinematics(simulation.model, self._shown)  # the callback reads where the marker is
+        data, simulation.data = simulation.data, self._shown
+        try:
+            simulation._render_callback()
+        finally:
+            simulation.data = data
+        return simulation.model, self._shown
 
     def _with_success(self, raw: RawObservation, info: dict[str, Any]) -> dict[str, Any]:
         return {**info, "is_success": self.spec_of_task.success(self.env.unwrapped, raw, info)}

@@ -19,24 +19,27 @@ LR = 1e-3
 
 
 class StateRepresentation(nn.Module):
-    """z = E(O_t, A) and O_hat_{t+n} = O_t + D(z) for low-dimensional observations.
+    """z = E(O_t, A) and O_hat_{t+n} = O_t + D(z) for an observation of N tokens, side by side.
 
-    E is a transformer encoder over one observation token and n action tokens; z is read from the observation
-    token. D is a two-layer MLP that predicts the *change* of the observation, which leaves
+    Low-dimensional observations are one token; the feature maps of cameras (guidance/visual.py) are one per place. E is a
+    transformer encoder over observation tokens and n action tokens; z is read from the observation tokens. D is a
+    two-layer MLP that predicts the *change* of the observation, token by token, which leaves
     D(E(O, A)) - D(E(O, A_hat)) as it is and makes small motions easy to predict.
 
     Args:
-        observation_dim: D, all low-dimensional observation features side by side.
+        observation_dim: D, all features of all tokens side by side.
         action_dim: A.
         n_steps: n, executed steps per chunk.
+        n_tokens: N, a divisor of D.
     """
 
-    def __init__(self, observation_dim: int, action_dim: int, n_steps: int):
+    def __init__(self, observation_dim: int, action_dim: int, n_steps: int, n_tokens: int = 1):
         super().__init__()
-        self.n_steps = n_steps
-        self.observation_token = nn.Linear(observation_dim, WIDTH)
+        self.n_steps, self.n_tokens = n_steps, n_tokens
+        token_dim = observation_dim // n_tokens
+        self.observation_token = nn.Linear(token_dim, WIDTH)
         self.action_token = nn.Linear(action_dim, WIDTH)
-        self.position = nn.Parameter(torch.randn(1 + n_steps, WIDTH) * 0.02)
+        self.position = nn.Parameter(torch.randn(n_tokens + n_steps, WIDTH) * 0.02)
         layer = nn.TransformerEncoderLayer(
             WIDTH, N_HEADS, 4 * WIDTH, dropout=0.0, batch_first=True, norm_first=True
         )
@@ -45,17 +48,18 @@ class StateRepresentation(nn.Module):
         self.decoder = nn.Sequential(
             nn.Linear(LATENT_DIM, WIDTH),
             nn.GELU(),
-            nn.Linear(WIDTH, observation_dim),
+            nn.Linear(WIDTH, token_dim),
         )
 
     def encode(self, observation: Tensor, actions: Tensor) -> Tensor:
-        """The latent z = E(O, A), (B, L), for observations (B, D) and executed steps (B, n, A)."""
-        tokens = torch.cat([self.observation_token(observation)[:, None], self.action_token(actions)], dim=1)
-        return self.to_latent(self.encoder(tokens + self.position[: tokens.shape[1]])[:, 0])
+        """The latents z = E(O, A), (B, N, L), for observations (B, D) and executed steps (B, n, A)."""
+        observed = self.observation_token(observation.unflatten(1, (self.n_tokens, -1)))
+        tokens = torch.cat([observed, self.action_token(actions)], dim=1)
+        return self.to_latent(self.encoder(tokens + self.position[: tokens.shape[1]])[:, : self.n_tokens])
 
     def forward(self, observation: Tensor, actions: Tensor) -> Tensor:
         """The predicted observation after the executed steps, (B, D)."""
-        return observation + self.decoder(self.encode(observation, actions))
+        return observation + self.decoder(self.encode(observation, actions)).flatten(1)
 
 
 def reconstruction_loss(predicted: Tensor, future: Tensor, is_pad: Tensor) -> Tensor:

@@ -20,17 +20,18 @@ from lerobot_agpd.build import build_parts
 from lerobot_agpd.cards.distillation import distillation_facts
 from lerobot_agpd.cards.model_card import ModelFacts
 from lerobot_agpd.continuation import how_to_continue
-from lerobot_agpd.guidance.representation import LR, StateRepresentation
+from lerobot_agpd.guidance.representation import LR
 from lerobot_agpd.interrupts import InterruptMessage
 from lerobot_agpd.policies.carded import CardedPolicy
 from lerobot_agpd.policies.fused_groups import ParameterGroup, fused_groups
 from lerobot_agpd.policies.gradient_norms import GradientNorms
+from lerobot_agpd.policies.representations import make_representation
 from lerobot_agpd.replay.demonstrations import delivers_single_frames
 from lerobot_agpd.replay.export import merge, upload
 from lerobot_agpd.replay.normalization import Statistics
 from lerobot_agpd.replay.served_frames import serve_from_memory
 from lerobot_agpd.run import RunInfo
-from lerobot_agpd.student import Student, vector_dim
+from lerobot_agpd.student import Student
 from lerobot_agpd.weights import acting_parameters, not_finite_weight, require_weights
 
 logger = logging.getLogger(__name__)
@@ -74,10 +75,7 @@ class DistilledPolicy(CardedPolicy, Student):
         self.discriminator = None
         if config.adversary.weight > 0:
             self.discriminator = Discriminator(config.future_steps, action_dim, self.embedding_dim)
-        self.representation = None
-        if config.representation.type == "state":
-            n_steps = config.collect.n_action_steps or config.n_execute
-            self.representation = StateRepresentation(vector_dim(config), action_dim, n_steps)
+        self.representation, self.visual_encoder = make_representation(self)
         self._gradient_norms = GradientNorms(self.parameter_groups())
         self._last_norms: dict[str, float] = {}
         is_lerobots, run = run is None, run or RunInfo.of(config)

@@ -47,8 +47,10 @@ class DemonstrationFrames:
         config: the policy's configuration (features and normalization).
         dataset_meta: metadata of the training dataset, as `make_policy` passes it.
         dataset_stats: its statistics.
+        also_held: further low-dimensional features that are held in memory, those of a teacher that sees other things.
 
     Attributes:
+        keys: the action and the policy's own low-dimensional inputs, which batches hold.
         table: the frames in raw units, on the CPU.
 
     Raises:
@@ -61,6 +63,7 @@ class DemonstrationFrames:
         config: PreTrainedConfig,
         dataset_meta: LeRobotDatasetMetadata | None,
         dataset_stats: Statistics | None = None,
+        also_held: Sequence[str] = (),
     ):
         if dataset_meta is None:
             raise ValueError(
@@ -75,7 +78,7 @@ class DemonstrationFrames:
             revision=dataset_meta.revision,
             download_videos=False,
         )
-        self.table = FrameTable.from_dataset(self.dataset, self.keys)
+        self.table = FrameTable.from_dataset(self.dataset, list(dict.fromkeys([*self.keys, *also_held])))
         self.device = torch.device("cpu")
         self._stats = dataset_stats if dataset_stats is not None else dataset_meta.stats
         require_finite_frames(self.table, dataset_meta.repo_id)

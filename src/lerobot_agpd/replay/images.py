@@ -1,4 +1,4 @@
-"""Camera frames and tasks of T, read where they were recorded."""
+"""Camera frames and tasks of T."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
+from lerobot_agpd.replay.camera_frames import MEMORY_LIMIT, CameraFrames
 from lerobot_agpd.replay.frames import FrameTable
 from lerobot_agpd.replay.stored import StoredEpisode
 
@@ -19,58 +20,68 @@ class RecordedFrames:
     Args:
         dataset: the demonstrations, the first episodes of T.
         table: the columns of T, which grow.
+        memory_limit: bytes of camera frames held in memory.
     """
 
-    def __init__(self, dataset: LeRobotDataset, table: FrameTable):
+    def __init__(self, dataset: LeRobotDataset, table: FrameTable, memory_limit: int = MEMORY_LIMIT):
         self.dataset = dataset
         self.table = table
         self.n_demonstration_frames = len(table)
         self._n_demonstrations = len(table.lengths)
         self._tasks = _tasks(dataset)
-        self._collected: list[StoredEpisode] = []
+        self._episode_tasks: list[str] = []  # of collected episodes
+        self.cameras = CameraFrames(table, self._decode, dataset.meta.depth_keys, memory_limit)
 
     def append(self, episode: StoredEpisode) -> None:
         """Add a collected episode, whose columns the table has."""
-        self._collected.append(episode)
+        self._episode_tasks.append(episode.task)
+        self.cameras.append(episode)
 
-    def images(self, frame_index: Tensor, keys: Sequence[str]) -> dict[str, Tensor]:
-        """Cameras' frames (B, C, H, W) in [0, 1]; each distinct frame is read once."""
-        distinct, position = frame_index.cpu().unique(return_inverse=True)
-        read = [self._read(index, keys) for index in distinct.tolist()]
-        return {key: torch.stack([frames[key] for frames in read])[position] for key in keys}
+    def images(
+        self, frame_index: Tensor, keys: Sequence[str], n_obs_steps: int | None = None
+    ) -> dict[str, Tensor]:
+        """Cameras' frames (B, C, H, W) in uint8 (depth: float32); each distinct demonstration frame is decoded once.
 
-    def _read(self, index: int, keys: Sequence[str]) -> dict[str, Tensor]:
-        if index < self.n_demonstration_frames:
-            item: Any = self.dataset[index]
-            return {key: item[key] for key in keys}
-        episode, step = self._locate(index)
-        frames = {key: torch.from_numpy(episode.frame(key, step)) for key in keys}
-        return {key: frame.permute(2, 0, 1).float() / 255 for key, frame in frames.items()}
+        With `n_obs_steps` histories (B, n_obs_steps, C, H, W); an episode's first frame repeats.
+        """
+        if n_obs_steps is None:
+            return self.cameras.read(frame_index, keys)
+        index, deltas = frame_index.cpu(), torch.arange(1 - n_obs_steps, 1)
+        starts, _ = self.table.episode_bounds(index)
+        steps = (index[:, None] + deltas).clamp(min=starts[:, None])  # (B, n_obs_steps)
+        images = self.cameras.read(steps.flatten(), keys)
+        return {key: values.unflatten(0, steps.shape) for key, values in images.items()}
 
     def task(self, index: int) -> str:
         """The task of a frame's episode."""
         if index < self.n_demonstration_frames:
             return self._tasks[index]
-        return self._locate(index)[0].task
+        return self._episode_tasks[int(self.table.episode(torch.tensor([index]))) - self._n_demonstrations]
 
     def history(self, frame_index: Tensor, keys: Sequence[str], n_obs_steps: int) -> dict[str, Any]:
-        """Raw observation histories (B, n_obs_steps, ...) of frames, and their `task`s; an episode's first frame repeats."""
-        frame_index, deltas = frame_index.cpu(), torch.arange(1 - n_obs_steps, 1)
-        histories: dict[str, Any] = {"task": [self.task(index) for index in frame_index.tolist()]}
+        """Raw observation histories (B, n_obs_steps, ...) of frames, and their `task`s; an episode's first frame repeats.
+
+        Images are floats in [0, 1], as a teacher takes them.
+        """
         columns = self.table.columns
+        deltas = torch.arange(1 - n_obs_steps, 1)
+        histories: dict[str, Any] = {"task": [self.task(index) for index in frame_index.tolist()]}
         cameras = [key for key in keys if key not in columns]
         if cameras:
-            starts, _ = self.table.episode_bounds(frame_index)
-            steps = (frame_index[:, None] + deltas).clamp(min=starts[:, None])  # (B, n_obs_steps)
-            images = self.images(steps.flatten(), cameras)
-            histories |= {key: images[key].unflatten(0, steps.shape) for key in cameras}
+            images = self.images(frame_index, cameras, n_obs_steps)
+            histories |= {key: as_floats(values) for key, values in images.items()}
         vectors = (key for key in keys if key in columns)
         return histories | {key: self.table.gather(key, frame_index, deltas)[0] for key in vectors}
 
-    def _locate(self, index: int) -> tuple[StoredEpisode, int]:
-        frame = torch.tensor([index])
-        number, (start, _) = int(self.table.episode(frame)), self.table.episode_bounds(frame)
-        return self._collected[number - self._n_demonstrations], index - int(start)
+    def _decode(self, index: int) -> dict[str, Tensor]:
+        """All cameras of a demonstration frame, (C, H, W) in [0, 1]."""
+        item: Any = self.dataset[index]
+        return {key: item[key] for key in self.dataset.meta.camera_keys}
+
+
+def as_floats(images: Tensor) -> Tensor:
+    """Images of uint8 as floats in [0, 1]; floats stay as they are."""
+    return images.float() / 255 if images.dtype == torch.uint8 else images
 
 
 def _tasks(dataset: LeRobotDataset) -> list[str]:

@@ -13,9 +13,10 @@ from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_agpd.replay.demonstrations import Batch, DemonstrationFrames
+from lerobot_agpd.replay.frame_features import FrameFeatures
 from lerobot_agpd.replay.frames import ChunkStarts
 from lerobot_agpd.replay.gate import FarValues
-from lerobot_agpd.replay.images import RecordedFrames
+from lerobot_agpd.replay.images import RecordedFrames, as_floats
 from lerobot_agpd.replay.stored import StoredEpisode
 
 logger = logging.getLogger(__name__)
@@ -106,15 +107,15 @@ class Replay:
         return len(self.table) - self.n_demonstration_frames
 
     def extend(self, episodes: Iterable[StoredEpisode]) -> None:
-        """Append kept episodes: their columns to memory, their camera frames stay on disk.
+        """Append kept episodes: their columns, and as many of their camera frames as fit, to memory.
 
         Raises:
-            KeyError: if an episode lacks one of the demonstrations' features.
+            KeyError: if an episode lacks one of the features in memory.
             ValueError: if an episode is damaged.
         """
         n_starts, n_frames = len(self._collected_starts), len(self.table)
         for episode in episodes:
-            first, keys = len(self.table), self.demonstrations.keys
+            first, keys = len(self.table), list(self.table.columns)
             self.table.append({key: _column(episode, key) for key in keys}, [len(episode)])
             self.frames.append(episode)
             self._collected_starts.append(first, len(episode))
@@ -128,11 +129,6 @@ class Replay:
                 "none of the new episodes is longer than --policy.drop_n_last_frames=%d: none is trained on",
                 self._collected_starts.n_dropped,
             )
-
-    @property
-    def vector_keys(self) -> list[str]:
-        """Low-dimensional observation features."""
-        return [key for key in self.demonstrations.keys if key != ACTION]
 
     # ---- batches ----
 
@@ -183,29 +179,31 @@ class Replay:
         return {**images, **gathered, FRAME_INDEX: frame_index}
 
     def _images(self, batch: Batch, frame_index: Tensor, augment: bool) -> Batch:
-        """Normalized camera frames; those that the loader did not deliver are read from disk."""
+        """Normalized camera frames; those that the loader did not deliver are T's own."""
         if not self._cameras:
             return {}
         if self.config.history_length is not None:
-            histories = self.history(frame_index, self._cameras, self.config.history_length)
-            return {
-                key: self._normalized(key, histories[key], augment).to(batch[key]) for key in self._cameras
-            }
+            histories = self.frames.images(frame_index, self._cameras, self.config.history_length)
+            return {key: self._normalized(key, histories[key], batch[key], augment) for key in self._cameras}
         images = {key: batch[key] for key in self._cameras}
         exchanged = frame_index != batch["index"]
         if exchanged.any():
             read = self.frames.images(frame_index[exchanged], self._cameras)
             for key in self._cameras:
                 images[key] = images[key].clone()
-                images[key][exchanged] = self._normalized(key, read[key], augment).to(images[key])
+                images[key][exchanged] = self._normalized(key, read[key], images[key], augment)
         return images
 
-    def _normalized(self, key: str, images: Tensor, augment: bool) -> Tensor:
-        """A camera's frames or histories (B, ..., C, H, W), normalized; each gets one draw of the transforms."""
+    def _normalized(self, key: str, images: Tensor, like: Tensor, augment: bool) -> Tensor:
+        """A camera's frames or histories (B, ..., C, H, W), normalized; each gets one draw of the transforms.
+
+        They stay uint8, a quarter of the size, until they are on the device of `like`.
+        """
+        images = as_floats(images.to(like.device))
         is_depth = key in self.demonstrations.dataset.meta.depth_keys
         if augment and self.image_transforms is not None and not is_depth:
             images = torch.stack([self.image_transforms(image) for image in images])
-        return self.demonstrations.normalizer.normalize(key, images)
+        return self.demonstrations.normalizer.normalize(key, images).to(like)
 
     # ---- observations of frames ----
 
@@ -215,12 +213,22 @@ class Replay:
 
     def executed_future(self, frame_index: Tensor, keys: Sequence[str], n_steps: int) -> ExecutedFuture:
         """What the representation learns from, for frames (B,) and vectors `keys`."""
-        gather = self.demonstrations.gather
-        actions, _ = gather(ACTION, frame_index, torch.arange(n_steps))
-        observed = [gather(key, frame_index, torch.tensor([0, n_steps])) for key in keys]
-        now, later = (torch.cat([values[:, step] for values, _ in observed], dim=1) for step in (0, 1))
-        _, is_pad = observed[-1]
-        return ExecutedFuture(now, actions, later, is_pad[:, 1])
+        observed = [
+            self.demonstrations.gather(key, frame_index, torch.tensor([0, n_steps]))[0] for key in keys
+        ]
+        now, later = (torch.cat([values[:, step] for values in observed], dim=1) for step in (0, 1))
+        return ExecutedFuture(now, *self._executed(frame_index, n_steps, later))
+
+    def visual_future(self, frame_index: Tensor, features: FrameFeatures, n_steps: int) -> ExecutedFuture:
+        """The same with the features of camera frames."""
+        index = frame_index.cpu()
+        _, ends = self.table.episode_bounds(index)
+        later = features.at(torch.minimum(index + n_steps, ends - 1))
+        return ExecutedFuture(features.at(index), *self._executed(frame_index, n_steps, later))
+
+    def _executed(self, frame_index: Tensor, n_steps: int, later: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        actions, is_pad = self.demonstrations.gather(ACTION, frame_index, torch.arange(n_steps + 1))
+        return actions[:, :n_steps], later, is_pad[:, n_steps]
 
 
 def _column(episode: StoredEpisode, key: str) -> Tensor:

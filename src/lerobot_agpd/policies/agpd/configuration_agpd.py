@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import DiffuserSchedulerConfig
 from lerobot.policies.act.configuration_act import ACTConfig
 
 from lerobot_agpd.config import StudentConfig, require, require_at_least, require_scheduler
+
+EncoderName = Literal["resnet", "resnet_group_norm", "small"]
 
 
 @PreTrainedConfig.register_subclass("agpd")
@@ -25,6 +28,12 @@ class AGPDConfig(ACTConfig, StudentConfig):
             "ACTION": NormalizationMode.MEAN_STD,
         }
     )
+    # Image encoder. resnet: LeRobot's vision_backbone, whose batch norm is the pretrained weights' and frozen;
+    # resnet_group_norm: the same without pretrained weights; small: four convolutions, for a CPU. The last two learn from
+    # scratch, so they take optimizer_lr in the place of optimizer_lr_backbone.
+    encoder: EncoderName = "resnet"
+    # encoder=small: largest random shift of training images, pixels; 0: none.
+    encoder_shift: int = 2
     # Learning rate schedule, e.g. cosine; default: constant, as LeRobot trains ACT.
     scheduler_name: str | None = None
     # Steps over which a scheduled learning rate rises.
@@ -33,7 +42,10 @@ class AGPDConfig(ACTConfig, StudentConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_scheduler(self.scheduler_name)
-        require_at_least(self, 0, "scheduler_warmup_steps")
+        require_at_least(self, 0, "scheduler_warmup_steps", "encoder_shift")
+        if self.encoder != "resnet":
+            self.pretrained_backbone_weights = None
+            self.optimizer_lr_backbone = self.optimizer_lr
         n_steps = self.collect.n_action_steps
         require(
             n_steps is None or n_steps <= self.chunk_size,

@@ -41,6 +41,7 @@ class AGPDDiffusionPolicy(DistilledPolicy, DiffusionTransformerPolicy):  # type:
     ):
         """Build the policy and the adversary; without `dataset_meta` it can be evaluated but not trained."""
         run = run or RunInfo.of(config)
+        config.select_inputs()
         super().__init__(config, dataset_stats, dataset_meta, run, **kwargs)
         self.init_distillation(dataset_meta, dataset_stats, run)
 

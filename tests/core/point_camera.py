@@ -1,0 +1,115 @@
+"""The point mass of point_environment with a camera, and a teacher that sees another thing than its student."""
+
+from dataclasses import dataclass, field
+
+import gymnasium as gym
+import numpy as np
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.envs import EnvConfig
+from point_environment import FPS, GAIN, LIMIT, Point, PointTeacher
+from small_dataset import FEATURES
+
+NAME = "lerobot_agpd_tests/PointCamera-v0"
+STATE, ENV, IMAGE = "observation.state", "observation.environment_state", "observation.image"
+SIZE = 24
+
+
+class PointCamera(Point):
+    """Shows the point as a white dot in an image whose edges are 3 long."""
+
+    def __init__(self, size: int = SIZE):
+        self.size = size
+        spaces = dict(Point.observation_space)
+        self.observation_space = gym.spaces.Dict(
+            **spaces, pixels=gym.spaces.Box(0, 255, (size, size, 3), np.uint8)
+        )
+
+    def observation(self):
+        pixels = np.full((self.size, self.size, 3), 40, dtype=np.uint8)
+        row, column = ((self.position / 3 + 0.5) * (self.size - 2)).clip(0, self.size - 2).astype(int)
+        pixels[row : row + 2, column : column + 2] = 255
+        return {**super().observation(), "pixels": pixels}
+
+
+if NAME not in gym.registry:
+    gym.register(NAME, entry_point=PointCamera, max_episode_steps=LIMIT)
+
+
+@EnvConfig.register_subclass("agpd_test_point_camera")
+@dataclass
+class PointCameraEnv(EnvConfig):
+    """`--env.type=agpd_test_point_camera`; `shown` raw keys."""
+
+    task: str | None = "PointCamera-v0"
+    fps: int = FPS
+    size: int = SIZE
+    shown: tuple[str, ...] = ("agent_pos", "environment_state", "pixels")
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    features_map: dict[str, str] = field(
+        default_factory=lambda: {
+            "action": "action",
+            "agent_pos": STATE,
+            "environment_state": ENV,
+            "pixels": IMAGE,
+        }
+    )
+
+    def __post_init__(self):
+        all_features = {
+            "agent_pos": PolicyFeature(FeatureType.STATE, (2,)),
+            "environment_state": PolicyFeature(FeatureType.ENV, (3,)),
+            "pixels": PolicyFeature(FeatureType.VISUAL, (SIZE, SIZE, 3)),  # whatever it delivers
+        }
+        self.features = {key: all_features[key] for key in self.shown}
+        self.features["action"] = PolicyFeature(FeatureType.ACTION, (2,))
+
+    @property
+    def package_name(self):
+        return NAME.split("/")[0]
+
+    @property
+    def gym_kwargs(self):
+        return {"size": self.size}
+
+
+class StateTeacher(PointTeacher):
+    """Goes toward the origin, whose direction and distance it sees in the environment state alone."""
+
+    def __init__(self, spread=0.01):
+        super().__init__(spread)
+        self.policy.config.input_features = {ENV: PolicyFeature(FeatureType.ENV, (3,))}
+
+    def sample(self, history, guide=None, generator=None):
+        assert set(history) - {"task"} >= {ENV}
+        seen = history[ENV]
+        return super().sample(
+            {STATE: seen[..., :2] * seen[..., 2:], "task": history["task"]}, guide, generator
+        )
+
+
+def demonstrate(root, n_episodes: int = 3, left_out: tuple[str, ...] = ()) -> LeRobotDataset:
+    """Record episodes of the teacher's law, without some of the features."""
+    image = {"dtype": "image", "shape": (SIZE, SIZE, 3), "names": ["height", "width", "channels"]}
+    features = {key: value for key, value in {**FEATURES, IMAGE: image}.items() if key not in left_out}
+    dataset = LeRobotDataset.create("local/point_camera", FPS, features, root=root, use_videos=False)
+    env = PointCamera()
+    for seed in range(n_episodes):
+        observation, _ = env.reset(seed=seed)
+        done = False
+        while not done:
+            action = (-GAIN * env.position).astype(np.float32)
+            frame = {
+                STATE: observation["agent_pos"],
+                ENV: observation["environment_state"],
+                IMAGE: observation["pixels"],
+                "action": action,
+                "task": Point.task_description,
+            }
+            observation, reward, done, _, _ = env.step(action)
+            outcome = {"next.reward": np.float32(reward), "next.success": done, "next.done": done}
+            frame |= {key: np.array([value]) for key, value in outcome.items()}
+            dataset.add_frame({key: value for key, value in frame.items() if key not in left_out})
+        dataset.save_episode()
+    dataset.finalize()
+    return LeRobotDataset(dataset.repo_id, root=dataset.root)
