@@ -168,18 +168,3 @@ def executed_steps(config: StudentConfig, teacher: Teacher | None) -> int:
         + ", ".join(f"{name} {number}" for name, number in predicted.items()),
     )
     return n_steps
-
-
-def vector_dim(config: StudentConfig) -> int:
-    """Size D of all low-dimensional observations side by side.
-
-    Raises:
-        FlagError: if there are none.
-    """
-    features = config.input_features or {}
-    require(
-        bool(config.observed_vectors),
-        "--policy.representation.type=state predicts low-dimensional observations, but the inputs are "
-        f"{list(features)}; use --policy.representation.type=action",
-    )
-    return sum(features[key].shape[0] for key in config.observed_vectors)
