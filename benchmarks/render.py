@@ -1,5 +1,6 @@
 """Write docs/results/*.md and the README's tables from the committed results: benchmarks/*/report.json,
-benchmarks/latency/latency-*.json, benchmarks/diversity/*/sweep.json, benchmarks/environments/*.json and
+benchmarks/latency/latency-*.json, benchmarks/diversity/*/sweep.json, benchmarks/environments/*.json,
+benchmarks/interruptions/counts.json, benchmarks/faults/faults.json and
 benchmarks/comparison/results/<matrix>/<task>/<method>/<seed>/run.json.
 
 usage: python benchmarks/render.py          (python benchmarks/render.py --check fails if a page is out of date)
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import committed
 import numpy as np
+from robustness import faults_page, interruptions_page
 
 from lerobot_agpd.studies.comparison import write_pictures
 from lerobot_agpd.studies.frontier import NAMES
@@ -200,6 +202,8 @@ def render(draw: bool) -> dict[Path, str]:
     for folder in sorted(path.parent for path in (BENCHMARKS / "diversity").glob("*/sweep.json")):
         pages[PAGES / f"diversity-{folder.name}.md"] = diversity_page(folder)
     pages[PAGES / "environments.md"] = environments_page(BENCHMARKS / "environments")
+    pages[PAGES / "interruptions.md"] = interruptions_page(BENCHMARKS / "interruptions")
+    pages[PAGES / "faults.md"] = faults_page(BENCHMARKS / "faults")
     found = {path: read_comparison(path) for path in sorted(COMPARISON.glob("*.yaml"))}
     comparisons = {path: entry for path, entry in found.items() if entry is not None}
     for path, (matrix, results, missing) in comparisons.items():

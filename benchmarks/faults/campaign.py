@@ -11,6 +11,7 @@ import shlex
 import shutil
 import sys
 import tempfile
+from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
 
@@ -25,14 +26,27 @@ from tiny_runs import isolated, prepare, train
 from lerobot_agpd.files import write_json
 
 
+def count_settings() -> dict[str, object]:
+    """How many settings that make no sense are named, and by how many lines."""
+    lines = {name: len(said) for name, said in refusals().items()}
+    return {
+        "tried": len(lines),
+        "in_one_line": sum(n == 1 for n in lines.values()),
+        "in_several_lines": [name for name, n in lines.items() if n > 1],
+        "not_named": [name for name, n in lines.items() if n == 0],
+    }
+
+
 def main() -> None:
-    """Run the campaign; exit 1 if anything is not as it should be."""
+    """Inject the faults one after the other, and write down each."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--output", type=Path, required=True)
-    parser.add_argument("--only", default="", help="faults whose name contains this")
+    parser.add_argument(
+        "--only", help="faults whose name contains one of these words; `settings`: the settings"
+    )
     options = parser.parse_args()
-    results: dict[str, list[dict[str, object]]] = {}
-    settings: dict[str, str | None] = {}
+    words = options.only.split(",") if options.only else None
+    content = json.loads(options.output.read_text()) if options.output.exists() else {"faults": {}}
     with tempfile.TemporaryDirectory() as temporary:
         source = Path(temporary) / "source"
         source.mkdir()
@@ -40,29 +54,22 @@ def main() -> None:
         codes = train([*flags, f"--output_dir={source / 'finished'}"], source / "finished-log")
         assert codes == [0], (source / "finished-log" / "rank-0.log").read_text()[-2000:]
         for group, faults in FAULTS.items():
-            for number, fault in enumerate(
-                fault for fault in faults if any(word in fault.name for word in options.only.split(","))
-            ):
-                folder = Path(temporary) / f"{group}-{number}"
-                bench = Bench.create(folder, source, flags)
+            results = {entry["fault"]: entry for entry in content["faults"].get(group, [])}
+            for number, fault in enumerate(faults):
+                if words and not any(word in fault.name for word in words):
+                    continue
+                bench = Bench.create(Path(temporary) / f"{group}-{number}", source, flags)
                 result = isolated(lambda fault=fault, bench=bench: asdict(run_fault(fault, bench)))
                 assert isinstance(result, dict), result
-                as_expected = result["outcome"] == result["expected"] and not result["problems"]
-                sys.stdout.write(f"{'ok ' if as_expected else '-> '} {json.dumps(result)}\n")
-                sys.stdout.flush()
-                results.setdefault(group, []).append(result)
-                if as_expected:
-                    shutil.rmtree(folder)
-        if not options.only:
-            settings = refusals()
-    counts = [result["outcome"] for group in results.values() for result in group]
-    content = {
-        "command": shlex.join(sys.argv),
-        "outcomes": {outcome: counts.count(outcome) for outcome in sorted(set(counts))},
-        "faults": results,
-        "settings": {"tried": len(settings), "named": sum(line is not None for line in settings.values())},
-        "settings_without_a_line": [name for name, line in settings.items() if line is None],
-    }
+                shutil.rmtree(bench.folder)
+                sys.stdout.write(f"{json.dumps(result)}\n")
+                results[fault.name] = result
+                content["faults"][group] = list(results.values())
+                write_json(options.output, {"command": shlex.join(sys.argv), **content}, indent=1)
+        if words is None or "settings" in words:
+            content["settings"] = count_settings()
+    outcomes = Counter(result["outcome"] for group in content["faults"].values() for result in group)
+    content |= {"command": shlex.join(sys.argv), "outcomes": dict(sorted(outcomes.items()))}
     write_json(options.output, content, indent=1)
 
 

@@ -415,6 +415,10 @@ def signalled(number: int):
                     time.sleep(0.001)
                 os.kill(os.getpid(), number)
 
+            if (
+                signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+            ):  # as a shell starts what runs in its background
+                signal.signal(signal.SIGINT, signal.default_int_handler)
             threading.Thread(target=send, daemon=True).start()
             yield
 

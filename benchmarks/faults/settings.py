@@ -17,8 +17,8 @@ def received(config: TrainPipelineConfig) -> None:
     """What `lerobot-train` does until it has its configuration."""
 
 
-def refusal(policy_type: str, setting: str) -> str | None:
-    """The line that names flag and value; None if the setting is accepted, or refused without such a line."""
+def refusal(policy_type: str, setting: str) -> list[str]:
+    """The line that names flag and value, or the lines where they are on several; empty if they are not said."""
     sys.argv = ["lerobot-train", f"--policy.type={policy_type}", "--policy.device=cpu"]
     sys.argv += ["--dataset.repo_id=local/x", "--env.type=point", f"--policy.{setting}"]
     said = io.StringIO()
@@ -27,12 +27,16 @@ def refusal(policy_type: str, setting: str) -> str | None:
             received()
     except SystemExit:
         flag, value = setting.split("=")
-        shown = {value, value.removeprefix("-"), f"{value}.0"}
-        lines = [line.strip() for line in said.getvalue().splitlines() if flag in line]
-        return next((line for line in lines if any(text in line for text in shown)), None)
-    return None
+        shown = (value, value.removeprefix("-"), f"{value}.0")
+        lines = [line.strip() for line in said.getvalue().splitlines()]
+        naming = [number for number, line in enumerate(lines) if flag in line]
+        for first in naming:
+            for last in range(first, min(first + 3, len(lines))):
+                if any(text in lines[last] for text in shown):
+                    return lines[first : last + 1]
+    return []
 
 
-def refusals() -> dict[str, str | None]:
-    """The line of every setting."""
+def refusals() -> dict[str, list[str]]:
+    """The lines of every setting."""
     return {f"{name}: --policy.{setting}": refusal(name, setting) for name, setting in all_wrong_settings()}

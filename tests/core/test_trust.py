@@ -234,3 +234,10 @@ def test_a_run_folder_given_as_teacher(checkpoint, tmp_path):
     for path in (tmp_path / "run", tmp_path / "run" / "checkpoints"):
         with pytest.raises(FileNotFoundError, match=f"did you mean '{folder}'"):
             load_teacher(TeacherConfig(path=str(path)), "cpu")
+
+
+def test_a_teacher_with_a_setting_of_another_version(checkpoint):
+    file = checkpoint / "config.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "of_tomorrow": 1}))
+    with pytest.raises(FlagError, match="--policy.teacher.path=.* another version .*`of_tomorrow`"):
+        load_teacher(TeacherConfig(path=str(checkpoint)), "cpu")

@@ -19,11 +19,11 @@ pytestmark = pytest.mark.slow
 def test_killed_runs_lose_and_repeat_nothing(tmp_path: Path) -> None:
     counts = tmp_path / "counts.json"
     script = ROOT / "benchmarks" / "interruptions" / "campaign.py"
-    command = [sys.executable, script, f"--output={counts}", "--times=6", "--every=40", "--minutes=10"]
+    command = [sys.executable, script, f"--output={counts}", "--times=6", "--every=60", "--minutes=10"]
     done = subprocess.run(command, capture_output=True, text=True, env=environment(), timeout=1800)
     assert done.returncode == 0, done.stderr[-5000:]
-    result = json.loads(counts.read_text())
-    assert result["problems"] == [] and result["done"] >= 1, result
+    trials = json.loads(counts.read_text())["trials"]
+    assert trials and all(trial["killed"] and not trial["problems"] for trial in trials), trials
 
 
 def test_a_run_that_is_told_to_end_says_how_it_goes_on(

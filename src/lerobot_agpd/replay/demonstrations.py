@@ -111,7 +111,9 @@ class DemonstrationFrames:
             return
         index, columns = batch["index"].cpu(), self.table.columns
         raw = {key: columns[key][index] for key in self.keys}
-        self._normalizer = matching_normalizer(self.config, self._candidates(), raw, batch)
+        # LeRobot takes a batch (B,) of features of one number for a single vector, and makes it (1, B).
+        delivered = {key: batch[key].reshape(values.shape) for key, values in raw.items()}
+        self._normalizer = matching_normalizer(self.config, self._candidates(), raw, delivered)
         self.device = batch[ACTION].device
 
     def gather(self, key: str, index: Tensor, delta_indices: Tensor) -> tuple[Tensor, Tensor]:
