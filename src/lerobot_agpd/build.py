@@ -15,6 +15,7 @@ from lerobot_agpd.guidance.strength import STEPS_FLAG, first_strength, require_s
 from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.loading import check_fit, collection_environment, load_teacher
 from lerobot_agpd.progress import Progress, find_replay_root
+from lerobot_agpd.references import References, make_references
 from lerobot_agpd.replay.demonstrations import DemonstrationFrames
 from lerobot_agpd.replay.export import check_observation
 from lerobot_agpd.replay.journal import EpisodeJournal
@@ -40,7 +41,8 @@ class Parts:
         replay: T.
         teacher: None without one, and in self-distillation.
         self_teacher: in self-distillation.
-        teacher_chunks: the teacher's chunks on T; None if neither adversary nor relabeling uses them.
+        teacher_chunks: the teacher's chunks at the frames of T; None if they are not used.
+        references: what the adversary compares the student with.
         collector: None if no round is to be collected.
         journal: the collected episodes on disk; None if no round is to be collected.
         reports: of the rounds that T holds already.
@@ -54,6 +56,7 @@ class Parts:
     teacher: Teacher | None
     self_teacher: SelfTeacher | None
     teacher_chunks: TeacherChunks | None
+    references: References
     collector: Collector | None
     journal: EpisodeJournal | None
     reports: tuple[RoundReport, ...]
@@ -105,13 +108,15 @@ def build_parts(
         check = partial(check_observation, meta.features)
         rank, n_ranks = processes.process_index, processes.num_processes
         collector = Collector(config, env_config, meta, journal, check, seed, rank, n_ranks)
+    teacher_chunks, references = make_references(config, teacher, replay, progress, seed)
     return Parts(
         run=run,
         progress=progress,
         replay=replay,
         teacher=teacher,
         self_teacher=self_teacher,
-        teacher_chunks=_teacher_chunks(config, teacher, replay, seed),
+        teacher_chunks=teacher_chunks,
+        references=references,
         collector=collector,
         journal=journal,
         reports=_adopt_rounds(journal, replay, progress),
@@ -160,21 +165,6 @@ def _self_teacher(student: Student, progress: Progress) -> SelfTeacher | None:
     if progress.checkpoint is not None:
         self_teacher.restore(progress.checkpoint)
     return self_teacher
-
-
-def _teacher_chunks(
-    config: StudentConfig, teacher: Teacher | None, replay: Replay, seed: int
-) -> TeacherChunks | None:
-    if teacher is None or not config.needs_teacher_chunks:
-        return None
-    masks_padding = getattr(config, "do_mask_loss_for_padding", True)  # without that setting: always, as ACT
-    require(
-        config.replay.relabel == "none" or masks_padding or teacher.n_chunk_steps >= config.future_steps,
-        f"--policy.replay.relabel={config.replay.relabel}: the teacher predicts {teacher.n_chunk_steps} steps from the "
-        f"current one on, the student's chunk has {config.future_steps}, and its loss counts the recorded steps behind "
-        "the teacher's; pass --policy.do_mask_loss_for_padding=true, which leaves them out",
-    )
-    return TeacherChunks(teacher, replay, config.future_steps, seed)
 
 
 # ---- collection ----

@@ -7,7 +7,6 @@ check the frames, compute the statistics and keep the metadata; only the frames'
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import datasets
