@@ -4,7 +4,7 @@
 UV := $(shell uv --version >/dev/null 2>&1 && echo uv || echo .uv/bin/uv)
 RUN := $(UV) run --frozen --all-extras
 
-.PHONY: help setup quickstart test test-fast lint docs .mypy
+.PHONY: help setup quickstart bench test test-fast lint docs .mypy
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -18,6 +18,10 @@ setup: $(filter .uv/bin/uv,$(UV))  ## install the package with all extras into .
 
 quickstart: setup  ## distill a teacher that lifts any of three cubes, offline, and watch it
 	@PATH="$(CURDIR)/.venv/bin:$$PATH" bash examples/quickstart.sh
+
+bench: setup  ## how fast it is, against LeRobot and against the floors, in a quarter of an hour
+	@MUJOCO_GL=$${MUJOCO_GL:-egl} HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(RUN) python benchmarks/speed/bench.py
+	@$(RUN) python benchmarks/render.py
 
 test: setup  ## all tests, fast ones first
 	@OMP_NUM_THREADS=1 $(RUN) pytest -m "not slow" -n auto --dist loadfile

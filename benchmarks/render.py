@@ -1,6 +1,6 @@
 """Write docs/results/*.md and the README's tables from the committed results: benchmarks/*/report.json,
-benchmarks/latency/latency-*.json, benchmarks/diversity/*/sweep.json, benchmarks/environments/*.json,
-benchmarks/interruptions/counts.json, benchmarks/faults/faults.json and
+benchmarks/latency/latency-*.json, benchmarks/speed/speed-cpu.json, benchmarks/diversity/*/sweep.json,
+benchmarks/environments/*.json, benchmarks/interruptions/counts.json, benchmarks/faults/faults.json and
 benchmarks/comparison/results/<matrix>/<task>/<method>/<seed>/run.json.
 
 usage: python benchmarks/render.py          (python benchmarks/render.py --check fails if a page is out of date)
@@ -74,6 +74,40 @@ def latency_page(path: Path) -> str:
         rows.append((name, size, sampler, *times))
     where = f"{content['device']}, {content['threads']} thread(s), torch {content['torch']}."
     return f"{text(path.parent)}\n\n{where}\n\n{markdown(rows)}\n"
+
+
+def speed_page(path: Path) -> str:
+    """CPU time and ratios of `benchmarks/speed`, beside the ratios before its improvements."""
+    content = json.loads(path.read_text())
+    before_path = path.with_name(f"{path.stem}-before.json")
+    before = json.loads(before_path.read_text())["sections"] if before_path.exists() else {}
+    host = content["host"]
+    versions = ", ".join(f"{name} {content['versions'][name]}" for name in ("python", "torch", "lerobot"))
+    machine = f"{host['cpu']}, {host['cores']} cores, {content['threads']} thread; {versions}."
+    tables = {
+        name: markdown(speed_table(section["rows"], before.get(name, {}).get("rows", {})))
+        for name, section in content["sections"].items()
+    }
+    return text(path.parent).format(machine=machine, **tables) + "\n"
+
+
+def speed_table(rows: dict[str, dict[str, float]], before: dict[str, dict[str, float]]) -> list[tuple]:
+    """One row per action; a dash where something was not measured."""
+    columns = {"cpu_ms": "CPU, ms", "wall_ms": "wall, ms", "frames_per_s": "kept frames/s", "bytes": "bytes"}
+    used = [key for key in columns if any(key in row for row in rows.values())]
+    used = [key for key in used if key != "wall_ms" or "cpu_ms" not in used]
+    table = [("", *(columns[key] for key in used), "ratio", "before")]
+    for name, row in rows.items():
+        cells = [
+            f"{row[key]:.3g}" if key in row and row[key] < 1000 else _whole(row.get(key)) for key in used
+        ]
+        ratios = [entry.get("ratio") for entry in (row, before.get(name, {}))]
+        table.append((name, *cells, *("-" if ratio is None else f"{ratio:.2f}" for ratio in ratios)))
+    return table
+
+
+def _whole(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0f}"
 
 
 def diversity_page(folder: Path) -> str:

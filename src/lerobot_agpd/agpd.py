@@ -51,6 +51,7 @@ from lerobot_agpd.guidance.teacher import History
 from lerobot_agpd.guidance.teacher_student import TeacherStudent
 from lerobot_agpd.replay.demonstrations import Batch
 from lerobot_agpd.replay.replay import FRAME_INDEX
+from lerobot_agpd.rollout.diagnostics import RoundDiagnostics
 from lerobot_agpd.rollout.report import RoundReport, log_round, read_reports, round_scalars, success_rate
 from lerobot_agpd.rollout.seeds import STUDENT_NOISE_STREAM
 from lerobot_agpd.rollout.strategies import (
@@ -186,8 +187,8 @@ class AGPD:
         self.student = student
         self.config = student.config
         self.run, self.progress = parts.run, parts.progress
-        self.replay, self.teacher_chunks = parts.replay, parts.teacher_chunks
-        self.frame_features = parts.frame_features
+        self.replay, self.references = parts.replay, parts.references
+        self.teacher_chunks, self.frame_features = parts.teacher_chunks, parts.frame_features
         self.teacher, self.self_teacher = parts.teacher, parts.self_teacher
         self.collector, self.journal = parts.collector, parts.journal
         self.seed, self.rank = parts.seed, parts.rank
@@ -280,6 +281,7 @@ class AGPD:
     def _report(self, number: int, strength: float, strategy: Strategy) -> RoundReport:
         assert self.collector is not None and self.journal is not None and self.teacher is not None
         guides = self.config.collect.guides and strength > 0
+        diagnostics = self.collector.diagnose(number, strength, strategy)
         report = RoundReport.of(
             self.journal.records(number),
             round=number,
@@ -288,11 +290,19 @@ class AGPD:
             next_strength=self.strength,
             guidance_scale=guidance_scale(self.teacher, strength, self.config.guidance) if guides else None,
             seconds=dict(strategy.stopwatch.seconds),
-            diagnostics=self.collector.diagnose(number, strength, strategy),
+            teacher_samples=self._teacher_samples(strategy, diagnostics),
+            diagnostics=diagnostics,
         )
         if not self.config.collect.guides:
             return report
         return replace(report, next_strength=self._adapted_strength(report))
+
+    def _teacher_samples(self, strategy: Strategy, diagnostics: RoundDiagnostics | None) -> dict[str, int]:
+        return {
+            "collection": strategy.stopwatch.counts.get("teacher", 0),
+            "diagnostics": diagnostics.teacher_samples if diagnostics else 0,
+            "references": self.references.take_sample_count(),
+        }
 
     def _adapted_strength(self, report: RoundReport) -> float:
         # A frozen teacher's own rate is best known from all rounds; one that still learns has only its newest.
@@ -308,31 +318,23 @@ class AGPD:
     def train_batch(self, batch: Batch) -> Batch:
         """A batch of T: the loader's frames, a fraction exchanged for collected ones."""
         self.replay.observe(batch)
-        # Stateless, so that a resumed run draws the same frames.
-        state = hash((self.seed, self.rank, self.progress.step + self._micro_batch))
+        generator = self._generator(self.progress.step + self._micro_batch)
         self._micro_batch = (self._micro_batch + 1) % self.run.steps_per_update
-        batch = self.replay.train_batch(batch, torch.Generator().manual_seed(state % 2**63))
+        batch = self.replay.train_batch(batch, generator)
         if self.teacher_chunks is None or self.config.replay.relabel == "none":
             return batch
         return self.teacher_chunks.relabel(batch, self.config)
 
-    def adversary_batch(self, batch: Batch) -> AdversaryBatch | None:
-        """The teacher's chunks for the frames of a batch; None where the adversary does not act at this step.
+    def _generator(self, *numbers: int) -> torch.Generator:
+        """Random numbers of a training step; they have no state, so that a resumed run draws the same."""
+        return torch.Generator().manual_seed(hash((self.seed, self.rank, *numbers)) % 2**63)
 
-        In self-distillation these are the executed chunks of kept episodes: against its own chunks, D would separate a
-        policy from itself.
-        """
+    def adversary_batch(self, batch: Batch) -> AdversaryBatch | None:
+        """The teacher's chunks at recorded observations; None where the adversary does not act at this step."""
         config, step = self.config.adversary, self.progress.step
         if config.weight == 0 or step < config.start or (step // self.run.steps_per_update) % config.every:
             return None
-        if self.teacher_chunks is not None:
-            chunk, n_shared = self.teacher_chunks.at(batch[FRAME_INDEX])
-            compared = torch.arange(chunk.shape[1], device=chunk.device) < n_shared
-            return AdversaryBatch(batch, chunk, compared.expand(len(chunk), -1))
-        kept = batch[FRAME_INDEX] >= self.replay.n_demonstration_frames
-        batch = {key: value[kept] for key, value in batch.items()}
-        present = self.config.present_step
-        return AdversaryBatch(batch, batch[ACTION][:, present:], ~batch["action_is_pad"][:, present:])
+        return self.references.batch(batch, len(self.reports), self._generator(step, self._micro_batch))
 
     def losses(
         self,

@@ -18,6 +18,7 @@ from lerobot_agpd.guidance.strength import STEPS_FLAG, first_strength, require_s
 from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.loading import check_fit, collection_environment, load_teacher, vectors
 from lerobot_agpd.progress import REPLAY_FOLDER, Progress, find_replay_root
+from lerobot_agpd.references import References, make_references
 from lerobot_agpd.replay.chunk_store import FOLDER, ChunkStore
 from lerobot_agpd.replay.demonstrations import DemonstrationFrames
 from lerobot_agpd.replay.export import check_observation
@@ -48,7 +49,8 @@ class Parts:
             none.
         teacher: None without one, and in self-distillation.
         self_teacher: in self-distillation.
-        teacher_chunks: the teacher's chunks on T; None if neither adversary nor relabeling uses them.
+        teacher_chunks: the teacher's chunks at the frames of T; None if they are not used.
+        references: what the adversary compares the student with.
         collector: None if no round is to be collected.
         journal: the collected episodes on disk; None if no round is to be collected.
         reports: of the rounds that T holds already.
@@ -63,6 +65,7 @@ class Parts:
     teacher: Teacher | None
     self_teacher: SelfTeacher | None
     teacher_chunks: TeacherChunks | None
+    references: References
     collector: Collector | None
     journal: EpisodeJournal | None
     reports: tuple[RoundReport, ...]
@@ -121,6 +124,9 @@ def build_parts(
             )  # environments declare sizes that they do not always deliver
         rank, n_ranks = processes.process_index, processes.num_processes
         collector = Collector(config, env_config, meta, journal, check, seed, rank, n_ranks)
+    teacher_chunks, references = make_references(
+        config, teacher, replay, progress, seed, _chunk_store(config, replay, seed, root)
+    )
     return Parts(
         run=run,
         progress=progress,
@@ -128,7 +134,8 @@ def build_parts(
         frame_features=_frame_features(student, replay),
         teacher=teacher,
         self_teacher=self_teacher,
-        teacher_chunks=_teacher_chunks(config, teacher, replay, seed, root),
+        teacher_chunks=teacher_chunks,
+        references=references,
         collector=collector,
         journal=journal,
         reports=_adopt_rounds(journal, replay, progress),
@@ -204,35 +211,19 @@ def _self_teacher(student: Student, progress: Progress) -> SelfTeacher | None:
     return self_teacher
 
 
-def _teacher_chunks(
-    config: StudentConfig, teacher: Teacher | None, replay: Replay, seed: int, root: Path | None
-) -> TeacherChunks | None:
-    if teacher is None or not config.needs_teacher_chunks:
+def _chunk_store(config: StudentConfig, replay: Replay, seed: int, root: Path | None) -> ChunkStore | None:
+    """Where the teacher's chunks at recorded frames are kept, beside the journal."""
+    if root is None:
         return None
-    masks_padding = getattr(config, "do_mask_loss_for_padding", True)  # without that setting: always, as ACT
-    require(
-        config.replay.relabel == "none" or masks_padding or teacher.n_chunk_steps >= config.future_steps,
-        f"--policy.replay.relabel={config.replay.relabel}: the teacher predicts {teacher.n_chunk_steps} steps from the "
-        f"current one on, the student's chunk has {config.future_steps}, and its loss counts the recorded steps behind "
-        "the teacher's; pass --policy.do_mask_loss_for_padding=true, which leaves them out",
-    )
-    store = None
-    if root is not None:
-        identity = _chunks_identity(config, replay, seed)
-        store = ChunkStore(root.with_name(FOLDER), identity, writes=PartialState().is_main_process)
-    return TeacherChunks(teacher, replay, config.future_steps, seed, store)
-
-
-def _chunks_identity(config: StudentConfig, replay: Replay, seed: int) -> dict[str, object]:
-    """What decides the teacher's chunks on the demonstrations and on the run's episodes."""
     dataset = replay.demonstrations.dataset.meta
     weights = Path(config.teacher.path) / SAFETENSORS_SINGLE_FILE
-    return {
+    identity = {
         **asdict(config.teacher),
         "weights": [weights.stat().st_size, weights.stat().st_mtime_ns] if weights.is_file() else None,
         "demonstrations": [dataset.repo_id, str(dataset.root), dataset.total_frames],
         "seed": seed,
     }
+    return ChunkStore(root.with_name(FOLDER), identity, writes=PartialState().is_main_process)
 
 
 # ---- collection ----

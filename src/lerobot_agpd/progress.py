@@ -30,6 +30,7 @@ class Progress:
         rounds: collection rounds in T.
         replay_root: folder of the collected episodes.
         seen_episodes: demonstrations that the loader has delivered.
+        reference_frames: frames of T at which the adversary has the teacher's chunks, by the rounds that T held then.
         checkpoint: folder that the counters were read from; None in a new run.
     """
 
@@ -37,6 +38,7 @@ class Progress:
     rounds: int = 0
     replay_root: str | None = None
     seen_episodes: list[int] = field(default_factory=list)
+    reference_frames: list[list[int]] = field(default_factory=list)
     checkpoint: Path | None = None
 
     @classmethod

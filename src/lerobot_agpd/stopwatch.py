@@ -1,4 +1,4 @@
-"""Where a round's time goes, and how long a call takes."""
+"""Where a round's time goes, how much was done in it, and how long a call takes."""
 
 from __future__ import annotations
 
@@ -12,9 +12,14 @@ import torch
 
 @dataclass
 class Stopwatch:
-    """Seconds spent, by name."""
+    """Seconds spent and things done, by name."""
 
     seconds: dict[str, float] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
+
+    def count(self, name: str, number: int) -> None:
+        """Add to what was done of `name`."""
+        self.counts[name] = self.counts.get(name, 0) + number
 
     @contextmanager
     def measure(self, name: str) -> Iterator[None]:

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from rich.console import Console
 
 from lerobot_agpd.cli.compare import CompareConfig, load
 from lerobot_agpd.config import FlagError
-from lerobot_agpd.studies.jobs import Job, run_jobs
+from lerobot_agpd.studies.jobs import Job, cluster_executor, run_jobs
 
 pytest.importorskip("lerobot_policy_agpd")  # registers the environment types
 
@@ -43,7 +44,7 @@ def test_jobs_run_their_commands_in_order_and_report_failures(tmp_path):
     check = f"assert open({str(tmp_path / 'a')!r}).read() == '3'; open({str(tmp_path / 'b')!r}, 'w')"
     good = job(tmp_path, "good", write.format(tmp_path / "a"), check)
     bad = job(tmp_path, "bad", "import sys; sys.exit('the reason')", write.format(tmp_path / "never"))
-    failures = run_jobs([bad, good], at_once=1, threads=3, console=Console(quiet=True))
+    failures = run_jobs([bad, good], ThreadPoolExecutor(1), 3, Console(quiet=True))
     assert (tmp_path / "b").exists()
     assert list(failures) == ["bad"] and "ended with 1" in failures["bad"] and "the reason" in failures["bad"]
     assert not (tmp_path / "never").exists()
@@ -54,6 +55,7 @@ def test_an_interrupt_ends_what_was_started(tmp_path, number):
     parent = f"""
 import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background commands ignore it
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from rich.console import Console
 from lerobot_agpd.studies.jobs import Job, run_jobs
@@ -61,7 +63,7 @@ code = "import os, pathlib, time; pathlib.Path('{tmp_path}', str(os.getpid()) + 
 def work(execute):
     execute([sys.executable, "-S", "-c", code], Path("{tmp_path}/log"))
     execute([sys.executable, "-S", "-c", code], Path("{tmp_path}/log"))
-run_jobs([Job(name, Path("{tmp_path}", name), work) for name in "abc"], 2, 1, Console(quiet=True))
+run_jobs([Job(name, Path("{tmp_path}", name), work) for name in "abc"], ThreadPoolExecutor(2), 1, Console(quiet=True))
 """
     process = subprocess.Popen([sys.executable, "-c", parent], stderr=subprocess.PIPE, text=True)
     wait_for(lambda: len(list(tmp_path.glob("*.pid"))) == 2, process)
@@ -81,22 +83,45 @@ def test_a_folder_that_another_process_works_on_is_left_alone(tmp_path):
         f"while not pathlib.Path({str(release)!r}).exists(): time.sleep(.05)\n"
     )
     parent = (
-        "import sys\nfrom pathlib import Path\nfrom rich.console import Console\n"
+        "import sys\nfrom concurrent.futures import ThreadPoolExecutor\nfrom pathlib import Path\nfrom rich.console import Console\n"
         "from lerobot_agpd.studies.jobs import Job, run_jobs\n"
         f"args = [sys.executable, '-S', '-c', {child!r}]\n"
         f"work = lambda execute: execute(args, Path({str(tmp_path / 'log')!r}))\n"
-        f"run_jobs([Job('x', Path({str(tmp_path / 'x')!r}), work)], 1, 1, Console(quiet=True))\n"
+        f"run_jobs([Job('x', Path({str(tmp_path / 'x')!r}), work)], ThreadPoolExecutor(1), 1, Console(quiet=True))\n"
     )
     process = subprocess.Popen([sys.executable, "-c", parent])
     wait_for(ready.exists, process)
     process.kill()
     process.wait()
     next_one = job(tmp_path, "x", f"open({str(again)!r}, 'w')")
-    assert "another process works on" in run_jobs([next_one], 1, 1, Console(quiet=True))["x"]
+    assert (
+        "another process works on" in run_jobs([next_one], ThreadPoolExecutor(1), 1, Console(quiet=True))["x"]
+    )
     assert not again.exists()
     release.touch()
-    wait_for(lambda: not run_jobs([next_one], 1, 1, Console(quiet=True)))
+    wait_for(lambda: not run_jobs([next_one], ThreadPoolExecutor(1), 1, Console(quiet=True)))
     assert again.exists()
+
+
+def test_submitit_makes_the_same_jobs(tmp_path):
+    """Its local executor: processes as a cluster would start them, with a job's commands in their own."""
+    pytest.importorskip("submitit")
+    good = job(
+        tmp_path,
+        "good",
+        f"import os; open({str(tmp_path / 'a')!r}, 'w').write(os.environ['OMP_NUM_THREADS'])",
+    )
+    bad = job(tmp_path, "bad", "import sys; sys.exit('the reason')")
+    executor = cluster_executor("local", tmp_path / "submitted", {"timeout_min": 5})
+    failures = run_jobs([good, bad], executor, 3, Console(quiet=True))
+    assert (tmp_path / "a").read_text() == "3"
+    assert list(failures) == ["bad"] and "the reason" in failures["bad"]
+
+
+def test_unknown_settings_of_a_cluster_are_refused(tmp_path):
+    pytest.importorskip("submitit")
+    with pytest.raises(FlagError, match="executor_options.*partitoin"):
+        cluster_executor("local", tmp_path / "submitted", {"slurm_partitoin": "gpu"})
 
 
 def test_wrong_options_are_refused(tmp_path):

@@ -276,7 +276,7 @@ def test_a_resumed_run_with_other_settings_warns(build, guided_config, tmp_path,
         (None, FileNotFoundError, "agpd_state.json is missing.*--policy.path"),
         ({"updates": 5}, ValueError, "another version"),
         (
-            {"step": 5, "rounds": 2, "replay_root": None, "seen_episodes": []},
+            {"step": 5, "rounds": 2, "replay_root": None, "seen_episodes": [], "reference_frames": []},
             FileNotFoundError,
             "2 collection rounds.*holds 0.*--policy.replay.root",
         ),

@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
+import torch
 
+from lerobot_agpd.replay.demonstrations import DemonstrationFrames
 from lerobot_agpd.replay.episode import Episode, EpisodeRecord, EpisodeSpec
 from lerobot_agpd.replay.journal import EpisodeJournal
+from lerobot_agpd.replay.replay import Replay
 
 IDENTITY = {"strategy": "guided", "environment": {"type": "a", "task": "b"}, "teacher": "t", "seed": 1}
 
@@ -86,3 +89,14 @@ def stored(journal, add, make_episode):
         return journal.kept(0)
 
     return build
+
+
+@pytest.fixture
+def small_replay(demonstrations, agpd_config) -> Replay:
+    """The demonstrations for chunks of 4 steps; the loader has delivered the first of them."""
+    config = agpd_config(chunk_size=4, n_action_steps=2)
+    frames = DemonstrationFrames(config, demonstrations.meta, demonstrations.meta.stats)
+    replay = Replay(frames, config, None)
+    columns = {key: frames.table.columns[key][:3] for key in frames.keys}
+    replay.observe({**columns, "index": torch.arange(3), "episode_index": torch.zeros(3, dtype=torch.long)})
+    return replay

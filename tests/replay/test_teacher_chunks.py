@@ -2,44 +2,19 @@
 
 import pytest
 import torch
+from noting_teacher import NotingTeacher
 
 from lerobot_agpd.replay.chunk_store import ChunkStore
-from lerobot_agpd.replay.demonstrations import DemonstrationFrames
-from lerobot_agpd.replay.replay import Replay
-from lerobot_agpd.replay.teacher_chunks import TeacherChunks
-
-STATE = "observation.state"
-
-
-class Teacher:
-    """Answers with the state, its step counted on, and noise; notes the frames it is asked for."""
-
-    n_obs_steps, n_chunk_steps = 2, 3
-    input_features = {STATE: None}
-
-    def __init__(self):
-        self.sampled = []
-
-    def sample(self, history, generator):
-        state = history[STATE][:, -1]
-        self.sampled += [tuple(row) for row in state.tolist()]
-        steps = torch.arange(5.0)[None, :, None]  # more than it has from now on
-        return state[:, None] + steps + torch.rand((len(state), 5, 2), generator=generator)
+from lerobot_agpd.replay.teacher_chunks import TeacherChunks, TeacherSampler
 
 
 @pytest.fixture
-def replay(demonstrations, agpd_config) -> Replay:
-    config = agpd_config(chunk_size=4, n_action_steps=2)
-    frames = DemonstrationFrames(config, demonstrations.meta, demonstrations.meta.stats)
-    replay = Replay(frames, config, None)
-    columns = {key: frames.table.columns[key][:3] for key in frames.keys}
-    replay.observe({**columns, "index": torch.arange(3), "episode_index": torch.zeros(3, dtype=torch.long)})
-    return replay
+def chunks(small_replay):
+    return make_chunks(small_replay)
 
 
-@pytest.fixture
-def chunks(replay):
-    return TeacherChunks(Teacher(), replay, n_chunk_steps=4, seed=7)
+def make_chunks(replay):
+    return TeacherChunks(TeacherSampler(NotingTeacher(), replay, n_chunk_steps=4), replay, seed=7)
 
 
 def raw(chunks, frames, seen=()):
@@ -67,21 +42,23 @@ def test_noise_is_the_episodes_own(chunks, demonstrations):
     noise = torch.rand((7, 5, 2), generator=torch.Generator().manual_seed(7 + 6))
     states = torch.tensor([[2.0, 0.0], [2.0, 2.0]])[:, None] + torch.arange(3.0)[None, :, None]
     torch.testing.assert_close(found, states + noise[[0, 2], :3], rtol=0, atol=1e-4)
-    other = TeacherChunks(Teacher(), chunks.replay, n_chunk_steps=4, seed=7)
+    other = make_chunks(chunks.replay)
     raw(other, [0], {0, 1})
     assert torch.equal(raw(other, [6, 8])[0], found)
 
 
 def test_every_frame_is_sampled_once(chunks, stored):
+    """With its episode, when one of that is asked for."""
+    sampled = chunks.sampler.teacher.sampled
     raw(chunks, [0], {0})
-    assert chunks.teacher.sampled == [(0, step) for step in range(5)]
+    assert sampled == [(0, step) for step in range(5)]
     chunks.replay.extend(stored(3, 2))
     before, _ = raw(chunks, [1])
-    assert len(chunks.teacher.sampled) == 5, "nothing of it was asked for"
+    assert len(sampled) == 5 == chunks.sampler.take_count()
     raw(chunks, [13, 17], {0, 2})
-    assert len(chunks.teacher.sampled) == 5 + 7 + 3 + 2 and len(set(chunks.teacher.sampled)) == 17
+    assert len(sampled) == 5 + 3 + 2 and len(set(sampled)) == 10
     raw(chunks, list(range(5)) + list(range(6, 18)), {0, 2})
-    assert len(chunks.teacher.sampled) == 17
+    assert len(sampled) == 17 and chunks.sampler.take_count() == 12
     assert torch.equal(raw(chunks, [1])[0], before), "growth keeps what is there"
 
 
@@ -89,10 +66,11 @@ class TestStore:
     """Chunks on disk are used again, by a process that would sample the same."""
 
     @pytest.fixture
-    def make(self, replay, tmp_path):
+    def make(self, small_replay, tmp_path):
         def make(writes=True, **identity):
             store = ChunkStore(tmp_path, identity, writes)
-            return TeacherChunks(Teacher(), replay, n_chunk_steps=4, seed=7, store=store)
+            sampler = TeacherSampler(NotingTeacher(), small_replay, n_chunk_steps=4)
+            return TeacherChunks(sampler, small_replay, seed=7, store=store)
 
         return make
 
@@ -100,13 +78,13 @@ class TestStore:
         first, second = make(), make()
         found, _ = raw(first, [0, 6], {0, 2})
         assert torch.equal(raw(second, [0, 6], {0, 2})[0], found)
-        assert first.teacher.sampled and not second.teacher.sampled
+        assert first.sampler.teacher.sampled and not second.sampler.teacher.sampled
 
     def test_another_teacher_is_asked_anew(self, make):
         first, second = make(path="a"), make(path="b")
         raw(first, [0], {0})
         raw(second, [0], {0})
-        assert second.teacher.sampled == first.teacher.sampled != []
+        assert second.sampler.teacher.sampled == first.sampler.teacher.sampled != []
 
     def test_a_damaged_or_unfitting_file_is_replaced(self, make):
         first = make()
@@ -116,7 +94,7 @@ class TestStore:
         for content in (b"", whole[: len(whole) // 2]):
             path.write_bytes(content)
             again = make()
-            assert torch.equal(raw(again, [0], {0})[0], found) and again.teacher.sampled
+            assert torch.equal(raw(again, [0], {0})[0], found) and again.sampler.teacher.sampled
             assert path.read_bytes() == whole
 
     def test_other_processes_read_only(self, make):
@@ -126,4 +104,4 @@ class TestStore:
         raw(make(), [0], {0})
         reader = make(writes=False)
         raw(reader, [0], {0})
-        assert not reader.teacher.sampled
+        assert not reader.sampler.teacher.sampled

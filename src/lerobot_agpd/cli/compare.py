@@ -2,6 +2,7 @@
 
 import logging
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -12,7 +13,7 @@ from rich.markdown import Markdown
 from lerobot_agpd.cli.command import entry_point
 from lerobot_agpd.config import require
 from lerobot_agpd.studies.comparison import REPORT, Comparison, write_report
-from lerobot_agpd.studies.jobs import run_jobs
+from lerobot_agpd.studies.jobs import Executor, cluster_executor, run_jobs
 from lerobot_agpd.studies.matrix import load_matrix
 from lerobot_agpd.studies.run_results import evaluate_run
 from lerobot_agpd.studies.runs import Run, check, expand
@@ -21,6 +22,9 @@ from lerobot_agpd.studies.training import check_same_command
 logger = logging.getLogger(__name__)
 
 Phase = Literal["all", "evaluate", "report"]
+ExecutorName = Literal["threads", "slurm", "local"]
+SUBMITTED = "submitted"
+"""Folder of submitit's files, in the output."""
 
 
 @dataclass
@@ -39,7 +43,11 @@ class CompareConfig:
     methods: list[str] = field(default_factory=list)
     # Part of its training seeds; default: all.
     seeds: list[int] = field(default_factory=list)
-    # Runs at a time.
+    # threads: --jobs runs at a time on this machine; slurm: jobs of a cluster, by submitit; local: submitit's processes here.
+    executor: ExecutorName = "threads"
+    # Settings of submitit's jobs, such as {timeout_min: 240, slurm_partition: gpu}.
+    executor_options: dict[str, int | str] = field(default_factory=dict)
+    # Runs at a time (executor=threads).
     jobs: int = 1
     # OMP_NUM_THREADS of each.
     threads: int = 1
@@ -64,6 +72,13 @@ def load(config: CompareConfig) -> tuple[Comparison, list[Run]]:
     return Comparison(config.matrix, matrix, config.threads), runs
 
 
+def make_executor(config: CompareConfig, output: Path) -> Executor:
+    """What makes the runs."""
+    if config.executor == "threads":
+        return ThreadPoolExecutor(config.jobs)
+    return cluster_executor(config.executor, output / SUBMITTED, config.executor_options)
+
+
 @entry_point("lerobot-agpd-compare")
 def main(config: CompareConfig) -> None:
     """Check, run what is missing, report."""
@@ -82,7 +97,7 @@ def main(config: CompareConfig) -> None:
         waiting = [run for run in runs if comparison.needs_work(run)]
         logger.info("%d runs, %d of them finished", len(runs), len(runs) - len(waiting))
         jobs = [comparison.job(run) for run in waiting]
-        failures = run_jobs(jobs, config.jobs, config.threads, console)
+        failures = run_jobs(jobs, make_executor(config, comparison.matrix.output), config.threads, console)
     if len(failures) < len(runs):
         console.print(Markdown(write_report(comparison.matrix)))
         logger.info("wrote %s, outcomes-*.png and curves-*.png to %s", REPORT, comparison.matrix.output)

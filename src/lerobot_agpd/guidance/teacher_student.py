@@ -73,7 +73,9 @@ class TeacherStudent:
     ) -> Tensor:
         """The teacher's executed steps, (B, n, A) raw."""
         with self.stopwatch.measure("teacher"):
-            return self.teacher.sample(history, guide, generator)[:, : self.n_steps]
+            actions = self.teacher.sample(history, guide, generator)[:, : self.n_steps]
+        self.stopwatch.count("teacher", len(actions))
+        return actions
 
     def student_actions(self, history: History) -> Tensor:
         """The student's executed steps, (B, n, A) raw."""

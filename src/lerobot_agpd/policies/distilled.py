@@ -155,6 +155,8 @@ class DistilledPolicy(CardedPolicy, Student):
             return
         self._require_finite_weights(self._agpd.progress.step + 1)
         if self._agpd.after_update():
+            if self._agpd.collector is not None:
+                self._agpd.collector.close()
             self._merge_episodes()
 
     def _require_finite_weights(self, step: int) -> None:

@@ -166,6 +166,27 @@ class Replay:
             frame_index[exchanged.to(frame_index.device)] = drawn.to(frame_index)
         return self._gather(batch, frame_index, augment=True)
 
+    def starts(self) -> Tensor:
+        """Frames that begin a chunk: those of the seen demonstrations, then the collected ones."""
+        seen = torch.tensor(sorted(self.seen_episodes), dtype=torch.long)
+        counts, ends = self._demonstrated_starts[seen], self.table.lengths.cumsum(0)[seen]
+        first = (ends - self.table.lengths[seen]).repeat_interleave(counts)
+        before = (counts.cumsum(0) - counts).repeat_interleave(counts)
+        demonstrated = first + torch.arange(len(first)) - before
+        return torch.cat(
+            [demonstrated, self._collected_starts.frames(torch.arange(len(self._collected_starts)))]
+        )
+
+    def batch_at(self, frame_index: Tensor) -> Batch:
+        """A batch of given frames, read from memory and disk."""
+        length, device = self.config.history_length, self.demonstrations.device
+        gathered = self.demonstrations.gather_batch(frame_index, self.config.chunk_delta_indices, length)
+        histories = self.history(frame_index, self._cameras, length or 1) if self._cameras else {}
+        for key in self._cameras:
+            images = self._normalized(key, histories[key], augment=False).to(device)
+            gathered[key] = images[:, 0] if length is None else images
+        return {**gathered, FRAME_INDEX: frame_index.to(device)}
+
     def eval_batch(self, batch: Batch) -> Batch:
         """The loader's frames with their chunks, for a held-out loss."""
         self.demonstrations.observe(batch)

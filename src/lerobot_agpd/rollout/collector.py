@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing
 
 import torch
-from gymnasium.vector import AsyncVectorEnv, VectorEnv
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors
+from lerobot.envs import EnvConfig, make_env_pre_post_processors
 from lerobot.utils.random_utils import seeded_context
 from tqdm import tqdm
 
@@ -17,12 +16,15 @@ from lerobot_agpd.config import StudentConfig
 from lerobot_agpd.replay.episode import Array, Episode, EpisodeRecord, EpisodeSpec
 from lerobot_agpd.replay.journal import EpisodeJournal
 from lerobot_agpd.rollout.diagnostics import (
+    ROUND_OBSERVATIONS,
+    ROUND_SAMPLES,
     ObservationReservoir,
     RoundDiagnostics,
     action_diagnostics,
     state_diagnostics,
 )
-from lerobot_agpd.rollout.rollout import Decision, Rollouts, step_limit
+from lerobot_agpd.rollout.kept_environments import KeptEnvironments, slots
+from lerobot_agpd.rollout.rollout import Decision, Rollouts
 from lerobot_agpd.rollout.seeds import (
     DIAGNOSTICS_STREAM,
     TEACHER_NOISE_STREAM,
@@ -32,7 +34,6 @@ from lerobot_agpd.rollout.seeds import (
     stream_seed,
 )
 from lerobot_agpd.rollout.strategies import Strategy
-from lerobot_agpd.rollout.watched import end_workers
 from lerobot_agpd.stopwatch import Stopwatch
 
 logger = logging.getLogger(__name__)
@@ -73,7 +74,7 @@ class Collector:
         self.check = check
         self.seed, self.rank, self.n_ranks = seed, rank, n_ranks
         self._reservoir: ObservationReservoir | None = None
-        self._own_limit: int | None = None  # steps of an episode, asked of the environment once
+        self._environments = KeptEnvironments(env_config, config.collect.use_async_envs)
 
     def noise(self, round_number: int) -> torch.Generator:
         """Source of this process's sampling noise in a round."""
@@ -115,7 +116,8 @@ class Collector:
         """
         self._reservoir = None
         if self.config.collect.diagnostics:
-            self._reservoir = ObservationReservoir(self.stream_seed(round_number, TEACHER_NOISE_STREAM))
+            seed = self.stream_seed(round_number, TEACHER_NOISE_STREAM)
+            self._reservoir = ObservationReservoir(seed, ROUND_OBSERVATIONS)
         missing = rank_part(self.specs(round_number, strength), done, self.rank, self.n_ranks)
         if not missing:
             return
@@ -168,14 +170,12 @@ class Collector:
         on_decision: Callable[[Decision], None] | None,
     ) -> Iterator[Episode]:
         """Roll out the specs, up to the first environments that get stuck: the last episodes then are theirs."""
-        collect = self.config.collect
-        n_envs = min(collect.n_envs, len(specs))
-        tasks = make_env(self.env_config, n_envs=n_envs, use_async_envs=collect.use_async_envs)
-        environments = [envs for suite in tasks.values() for envs in suite.values()]
+        collect, kept = self.config.collect, self._environments
+        environments = kept.of_size(slots(len(specs), collect.n_envs))
         processors = make_env_pre_post_processors(self.env_config, self.config)
+        max_steps = collect.max_episode_steps or self._own_limit()
         completed = False
         try:
-            max_steps = self._max_steps(environments)
             for position, envs in enumerate(environments):
                 rollouts = Rollouts(
                     envs, processors, strategy, on_decision, self.check, max_steps, collect.step_timeout
@@ -186,28 +186,19 @@ class Collector:
             completed = True
         finally:
             if not completed:
-                for envs in environments:
-                    end_workers(envs)
-            close_envs(tasks)
+                kept.end()
 
-    def _max_steps(self, environments: Sequence[VectorEnv]) -> int:
-        """Steps after which an episode is cut off: --policy.collect.max_episode_steps, or the environment's own limit.
+    def _own_limit(self) -> int:
+        """Steps after which an episode is cut off where no flag says it: one more than the environment's own limit.
 
-        One step more than its own, so that an environment that keeps its limit ends every episode itself.
+        So an environment that keeps its limit ends every episode itself.
         """
-        if self.config.collect.max_episode_steps is not None:
-            return self.config.collect.max_episode_steps
-        if self._own_limit is None:
-            if any(isinstance(envs, AsyncVectorEnv) for envs in environments):
-                # A worker process that is asked for an attribute that it lacks ends; an environment in this one does not.
-                tasks = make_env(self.env_config, n_envs=1, use_async_envs=False)
-                limits = [step_limit(envs) for suite in tasks.values() for envs in suite.values()]
-                close_envs(tasks)
-            else:
-                limits = [step_limit(envs) for envs in environments]
-            known = [limit for limit in limits if limit is not None]
-            self._own_limit = max(known) + 1 if len(known) == len(limits) else MAX_STEPS
-        return self._own_limit
+        limit = self._environments.step_limit
+        return MAX_STEPS if limit is None else limit + 1
+
+    def close(self) -> None:
+        """Close the environments, after the last round."""
+        self._environments.close()
 
     def require_valid_episodes(self, round_number: int) -> None:
         """Warn of a round's invalid episodes, of all processes, which have been dropped.
@@ -242,7 +233,10 @@ class Collector:
         seed = self.stream_seed(round_number, DIAGNOSTICS_STREAM)
         history = self._reservoir.history()
         with stopwatch.measure("diagnostics"), seeded_context(seed):
-            actions = action_diagnostics(strategy, history, strength, seed) if history else None
+            actions = (
+                action_diagnostics(strategy, history, strength, seed, ROUND_SAMPLES) if history else None
+            )
             kept = (episode.observations for episode in self.journal.kept(round_number))
             states = state_diagnostics(kept, self.demonstrations.stats or {}, seed)
-        return RoundDiagnostics(actions, states, stopwatch.seconds["diagnostics"])
+        n_sampled = actions["teacher_samples"] if actions else 0
+        return RoundDiagnostics(actions, states, stopwatch.seconds["diagnostics"], int(n_sampled))

@@ -29,11 +29,11 @@ from lerobot_agpd.rollout.diversity import (
 from lerobot_agpd.rollout.rollout import Decision
 from lerobot_agpd.rollout.strategies import Strategy
 
-N_OBSERVATIONS = 32
-"""Decisions of a round at which teacher and strategy are sampled again."""
+N_OBSERVATIONS, N_SAMPLES = 32, 16
+"""Decisions at which a study samples teacher and strategy again, and samples of both at each of them."""
 
-N_SAMPLES = 16
-"""Samples of both at each of them."""
+ROUND_OBSERVATIONS, ROUND_SAMPLES = 16, 2
+"""The same of a collection round, whose teacher has episodes to collect."""
 
 MAX_STATES = 2000
 """Visited states, at most, whose diversity is measured."""
@@ -57,11 +57,13 @@ class RoundDiagnostics:
         actions: `action_diagnostics` at a sample of the round's decisions; None if there was no decision.
         states: `state_diagnostics` of the kept episodes; None without any, or with images alone.
         seconds: what measuring took.
+        teacher_samples: chunks that the teacher was sampled for it.
     """
 
     actions: Mapping[str, float] | None
     states: Mapping[str, Any] | None
     seconds: float
+    teacher_samples: int = 0
 
     @property
     def scalars(self) -> dict[str, float]:
@@ -160,6 +162,7 @@ def action_diagnostics(
     divergence = action_kl(of_strategy, of_teacher)
     return {
         "observations": len(student),
+        "teacher_samples": repeated.stopwatch.counts["teacher"],
         "rms_to_student": _rms(of_strategy - student),
         "rms_to_teacher": _rms(of_strategy - of_teacher),
         "rms_teacher_to_student": _rms(of_teacher - student),
@@ -177,6 +180,8 @@ def sample_spread(samples: Tensor) -> float:
 def action_kl(actions: Tensor, reference: Tensor) -> Array:
     """KL divergence of moment-matched Gaussians over single actions (Eq. 14), (B * n,) in nats.
 
+    With fewer samples than a covariance needs, all observations and steps share one.
+
     Args:
         actions: (K, B, n, A) samples, in the teacher's units.
         reference: samples of the teacher, of the same shape.
@@ -184,7 +189,19 @@ def action_kl(actions: Tensor, reference: Tensor) -> Array:
     ours, theirs = (
         samples.permute(1, 2, 0, 3).flatten(0, 1).double().numpy() for samples in (actions, reference)
     )
-    return np.array([gaussian_kl(_blurred(p), _blurred(q)) for p, q in zip(ours, theirs, strict=True)])
+    pairs = zip(_gaussians(ours), _gaussians(theirs), strict=True)
+    return np.array([gaussian_kl(p, q) for p, q in pairs])
+
+
+def _gaussians(samples: Array) -> list[Gaussian]:
+    """Gaussians of samples (N, K, A) plus noise of standard deviation BLUR, one for each of the N."""
+    count, dim = samples.shape[1:]
+    if count > dim:
+        return [_blurred(own) for own in samples]
+    means = samples.mean(axis=1)
+    residuals = (samples - means[:, None]).reshape(-1, dim)
+    shared = residuals.T @ residuals / max(1, len(samples) * (count - 1))
+    return [Gaussian(mean, shared + BLUR**2 * np.eye(dim)) for mean in means]
 
 
 def _blurred(samples: Array) -> Gaussian:

@@ -73,6 +73,8 @@ class RoundReport:
         mean_guidance_shift: shift of the guided denoising steps in sigmas; None if nothing was guided.
         mean_student_steps: steps of the student's part (rollin).
         seconds: spent by one process, by activity.
+        teacher_samples: chunks that one process sampled of the teacher: for `collection`, for `diagnostics`, and since the
+            round before for `references` (of the adversary, or for relabeling).
         diagnostics: what the strategy did to actions and states; None if not measured.
     """
 
@@ -93,6 +95,7 @@ class RoundReport:
     mean_student_steps: float | None
     guidance_scale: float | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
+    teacher_samples: Mapping[str, int] = field(default_factory=dict)
     diagnostics: RoundDiagnostics | None = None
 
     @classmethod

@@ -1,4 +1,4 @@
-"""Run several jobs at a time, each a chain of commands in processes of their own."""
+"""Run jobs by an executor of `concurrent.futures`' interface, each a chain of commands in processes of their own."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol
 
 from rich.console import Console
 from rich.progress import (
@@ -24,11 +24,14 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
+from lerobot_agpd.config import FlagError
+
 logger = logging.getLogger(__name__)
 
 LOCK = "lock"
 LAST_LINES = 15
-GRACE = 10.0
+GRACE, POLL = 10.0, 0.1
+"""Seconds that a command has to end when it is told to, and between two looks at what has ended."""
 
 Execute = Callable[[Sequence[str], Path], None]
 """Runs a command whose output goes to the end of a log; raises RuntimeError with the log's end if it fails."""
@@ -49,28 +52,74 @@ class Job:
     work: Callable[[Execute], None]
 
 
-class Processes:
-    """The processes that jobs have started and that still run."""
+class Submitted(Protocol):
+    """What an executor returns: the part of `concurrent.futures.Future` that other libraries have too."""
 
-    def __init__(self, threads: int):
-        self.env = {**os.environ, "OMP_NUM_THREADS": str(threads)}
-        self.running: set[subprocess.Popen[bytes]] = set()
+    def done(self) -> bool:
+        """Whether it has ended."""
 
-    def run(self, job: Job, bars: Progress) -> None:
+    def exception(self) -> BaseException | None:
+        """What ended it, if it is done."""
+
+    def cancel(self) -> object:
+        """End it, or keep it from starting."""
+
+
+class Executor(Protocol):
+    """`concurrent.futures.Executor`, or another library's."""
+
+    def submit(self, function: Callable[[Job], None], job: Job, /) -> Submitted:
+        """Have the function called with the job, perhaps on another machine."""
+
+
+def cluster_executor(cluster: str, folder: Path, options: Mapping[str, int | str]) -> Executor:
+    """Submitit's executor for a cluster; `local` makes processes on this machine.
+
+    Args:
+        cluster: as submitit names it, such as slurm.
+        folder: where it keeps its files; one that all machines see.
+        options: what submitit's `update_parameters` takes, such as timeout_min.
+
+    Raises:
+        FlagError: if submitit is not installed or does not know an option.
+    """
+    try:
+        import submitit
+    except ImportError as error:
+        raise FlagError(
+            f"--executor={cluster} needs submitit: pip install 'lerobot_policy_agpd[cluster]'"
+        ) from error
+    executor = submitit.AutoExecutor(folder, cluster=cluster)
+    try:
+        executor.update_parameters(**options)
+    except (NameError, TypeError, ValueError) as error:
+        raise FlagError(f"--executor_options={dict(options)}: {error}") from error
+    return executor
+
+
+@dataclass
+class Commands:
+    """Runs the commands of jobs, and knows those that still run in this process.
+
+    Attributes:
+        threads: OMP_NUM_THREADS of each.
+    """
+
+    threads: int
+    running: set[subprocess.Popen[bytes]] = field(default_factory=set)
+
+    def run(self, job: Job) -> None:
         """Do a job's work in its locked folder."""
         with _locked(job.folder) as lock:
-            bar = bars.add_task(job.name, total=None)
-            try:
-                job.work(lambda command, log: self._execute(command, log, lock))
-            finally:
-                bars.remove_task(bar)
+            job.work(lambda command, log: self._execute(command, log, lock))
 
     def _execute(self, command: Sequence[str], log: Path, lock: int) -> None:
         """Run a command; it holds the lock too, so that the folder stays locked if this process is killed."""
+        env = {**os.environ, "OMP_NUM_THREADS": str(self.threads)}
         with (
             log.open("ab") as out,
             subprocess.Popen(  # noqa: S603  # no shell; the commands are those of the user's matrix
-                command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=self.env, pass_fds=[lock]
+                command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=env, pass_fds=[lock]
             ) as process,
         ):
             self.running.add(process)
@@ -79,44 +128,47 @@ class Processes:
         if returncode:
             raise RuntimeError(f"ended with {returncode}; the end of {log}:\n{_last_lines(log)}")
 
-    def end(self, futures: Iterable[Future[None]]) -> None:
-        """End all processes and wait for the threads that run them."""
+    def end(self, submitted: Iterable[Submitted]) -> None:
+        """End all jobs, and wait for those of this process."""
+        waiting = list(submitted)
+        for future in waiting:
+            future.cancel()
         deadline = time.monotonic() + GRACE
-        while not all(future.done() for future in futures):
+        while not all(future.done() for future in waiting) and time.monotonic() < 2 * GRACE + deadline:
             for process in list(self.running):
                 process.terminate() if time.monotonic() < deadline else process.kill()
-            time.sleep(0.1)
+            time.sleep(POLL)
 
 
-def run_jobs(jobs: Sequence[Job], at_once: int, threads: int, console: Console) -> dict[str, str]:
-    """Run jobs, `at_once` at a time; returns the errors by job.
+def run_jobs(jobs: Sequence[Job], executor: Executor, threads: int, console: Console) -> dict[str, str]:
+    """Run jobs, as many at a time as the executor does; returns the errors by job.
 
     A job whose folder another process works on is left alone: a started command holds the folder's lock even if
     this process is killed.
 
     Raises:
-        SystemExit: after an interrupt or SIGTERM, which ends all processes that were started.
+        SystemExit: after an interrupt or SIGTERM, which ends everything that was started.
     """
     failures: dict[str, str] = {}
-    processes = Processes(threads)
-    counted = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), *counted)
+    commands = Commands(threads)
+    columns = (SpinnerColumn(), TextColumn("runs"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: raises KeyboardInterrupt
-    with Progress(*columns, console=console, transient=True) as bars, ThreadPoolExecutor(at_once) as pool:
-        total = bars.add_task("runs", total=len(jobs))
-        futures = {pool.submit(processes.run, job, bars): job for job in jobs}
+    waiting = {executor.submit(commands.run, job): job for job in jobs}
+    with Progress(*columns, console=console, transient=True) as bars:
+        total = bars.add_task("", total=len(jobs))
         try:
-            for future in as_completed(futures):
-                name, error = futures[future].name, future.exception()
-                bars.advance(total)
-                if error is None:
-                    logger.info("%s: finished", name)
-                else:
-                    failures[name] = str(error)
-                    logger.error("%s: %s", name, error)
+            while waiting:
+                for future in [future for future in waiting if future.done()]:
+                    name, error = waiting.pop(future).name, future.exception()
+                    bars.advance(total)
+                    if error is None:
+                        logger.info("%s: finished", name)
+                    else:
+                        failures[name] = str(error)
+                        logger.error("%s: %s", name, error)
+                time.sleep(POLL)
         except KeyboardInterrupt:
-            pool.shutdown(wait=False, cancel_futures=True)
-            processes.end(futures)
+            commands.end(waiting)
             raise SystemExit("interrupted; run the same command to go on") from None
         finally:
             signal.signal(signal.SIGTERM, before)
