@@ -63,7 +63,7 @@ wait $cloning || { tail -n 30 "$output"/log/{cloned,first_report}.log >&2 && exi
 phase "3/4 animation and recording" viz lerobot-agpd-viz "${env[@]}" --env.visualization_width=320 \
     --env.visualization_height=320 --policy.path="$output/agpd/$last" --output="$output/guided.rrd" --png="$output/guided.png" \
     --policies="{teacher: $teacher, cloned: $output/cloned/$last, distilled: $output/agpd/$last}" \
-    --episodes="$FILM_EPISODES" --animation="$output/side_by_side.gif"
+    --episodes="$FILM_EPISODES" --speed=0.5 --animation="$output/side_by_side.gif"
 phase "4/4 evaluation on seeds that nothing else used" report "${report[@]}" --title="Lift any of three cubes" \
     --policies="{teacher: $teacher}" --runs="{cloned: $output/cloned, distilled: $output/agpd}" \
     --pictures="[$output/side_by_side.gif, $output/guided.png]" --sheet_episodes=16

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 from commands import EXAMPLES, run_here
+from pusht import record
 
 pytestmark = pytest.mark.slow
 
 DOCS = Path(__file__).parents[2] / "docs"
-TUTORIAL = DOCS / "tutorial.md"
+TUTORIAL, README = DOCS / "tutorial.md", DOCS.parent / "README.md"
 BLOCK = re.compile(r"```bash\n(.*?)```", re.DOTALL)
 
 LOOP = ["--steps=4", "--save_freq=4", "--log_freq=2", "--batch_size=8", "--num_workers=0"]
@@ -132,3 +133,26 @@ def test_the_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     run_page(TUTORIAL)
     assert (tmp_path / "outputs" / "report" / "report.html").is_file()
+
+
+def test_the_first_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On clumsy demonstrations of the same task, since the Hub's are not there."""
+    demos = record(tmp_path / "demos", pixels=False)
+    monkeypatch.chdir(tmp_path)
+    data = [f"--dataset.root={demos}", "--dataset.repo_id=local/pusht", "--dataset.episodes=[0,1]"]
+    network = ["--policy.down_dims=[16,32]", "--policy.horizon=16", "--policy.n_action_steps=8"]
+    teacher = [
+        *network,
+        "--policy.drop_n_last_frames=7",
+        "--policy.num_train_timesteps=4",
+        "--policy.device=cpu",
+    ]
+    student = [*SIZES["student_cpu"], *(f"--policy.collect.{flag}" for flag in ROUNDS), "--policy.device=cpu"]
+    make, *shown = commands(README)
+    assert make == ["make", "quickstart"]
+    for words, more in zip(
+        shown,
+        ([*LOOP, *data, *teacher], [*LOOP, *data, *student, *SHORT], QUICK["lerobot-eval"]),
+        strict=True,
+    ):
+        run_here(*words, *more)

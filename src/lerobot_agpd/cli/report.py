@@ -1,7 +1,7 @@
 """`lerobot-agpd-report`: evaluate runs side by side; a table, a picture, JSON and a page to look at."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -168,12 +168,8 @@ def run_part(name: str, run: Path, result: Result, config: ReportConfig) -> RunP
     )
 
 
-def write_report_page(results: Sequence[Result], config: ReportConfig) -> None:
-    """Write report.html."""
-    by_name = {result.name: result for result in results}
-    first = {
-        name: next(r for key, r in by_name.items() if key.split(", ")[0] == name) for name in config.runs
-    }
+def write_report_page(results: Sequence[Result], of_run: Mapping[str, Result], config: ReportConfig) -> None:
+    """Write report.html; `of_run` has the result of every run with its rounds."""
     pictures = {"Learning curves and collection rounds": config.output / "curves.png"}
     pictures |= {path.stem: path for path in config.pictures}
     write_page(
@@ -182,7 +178,7 @@ def write_report_page(results: Sequence[Result], config: ReportConfig) -> None:
         f"{config.env.type}, task {config.env.task}; {config.episodes} episodes, seeds from {config.seed}",
         summary_table(results),
         pictures,
-        [run_part(name, run, first[name], config) for name, run in config.runs.items()],
+        [run_part(name, run, of_run[name], config) for name, run in config.runs.items()],
     )
 
 
@@ -192,14 +188,16 @@ def main(config: ReportConfig) -> None:
     config.output.mkdir(parents=True, exist_ok=True)
     environment = draccus.encode(config.env, EnvConfig)
     results: list[Result] = []
+    of_entry: dict[str, Result] = {}
     n_envs = min(config.batch_size, config.episodes)
     with closing(Evaluator(config.env, n_envs, config.output, config.device)) as evaluator:
         for entries, evaluate in ((config.policies, report_policy), (config.runs, report_run)):
             for name, path in entries.items():
-                results += evaluate(name, path, evaluator, config)
+                rows = evaluate(name, path, evaluator, config)
+                of_entry[name], results = rows[0], [*results, *rows]
                 write_summary(results, environment, config.seed, config.output)
     draw_report_curves(results, config.title, config.output / "curves.png")
-    write_report_page(results, config)
+    write_report_page(results, of_entry, config)
     Console().print(console_table(summary_table(results)))
     logger.info("wrote report.html, report.json, report.md and curves.png to %s", config.output)
 

@@ -25,9 +25,9 @@ from lerobot_agpd.progress import REPLAY_FOLDER, Progress
 from lerobot_agpd.replay.episode import EpisodeSpec
 from lerobot_agpd.rollout.report import read_reports
 from lerobot_agpd.rollout.rollout import Rollouts
-from lerobot_agpd.studies.animation import Clip, Line, Style, require_animation, write_animation
+from lerobot_agpd.studies.animation import Style, require_animation, write_animation
+from lerobot_agpd.studies.clips import guided_clip, side_by_side
 from lerobot_agpd.studies.recording import (
-    COLORS,
     DecisionRecorder,
     FrameRecorder,
     RolloutRecord,
@@ -35,7 +35,6 @@ from lerobot_agpd.studies.recording import (
     plane_to_frame,
 )
 from lerobot_agpd.studies.rerun_log import blueprint, layout, log_rollout
-from lerobot_agpd.studies.solo import side_by_side
 from lerobot_agpd.studies.still import draw_still
 
 logger = logging.getLogger(__name__)
@@ -66,6 +65,8 @@ class VizConfig(StudentFlags):
     panel_width: int = 240
     # Show every how many-th step in the animation.
     stride: int = 1
+    # Speed of the animation: 1 is the environment's own time, 0.5 half of it.
+    speed: float = 1.0
     # Where the policies of --policies run; default: this machine's accelerator, else the CPU.
     device: str = ""
     # Record rendered frames.
@@ -105,13 +106,14 @@ class VizConfig(StudentFlags):
             self.render or self.animation is None,
             "--animation needs rendered frames, without --render=false",
         )
+        require(self.speed > 0, f"--speed must be positive, got {self.speed}")
         for name in ("stride", "panel_width"):
             require(getattr(self, name) >= 1, f"--{name} must be at least 1, got {getattr(self, name)}")
 
     @property
     def style(self) -> Style:
-        """How the animation looks: in the environment's own time."""
-        return Style(self.panel_width, self.stride, fps=min(30.0, self.env.fps / self.stride))
+        """How the animation looks."""
+        return Style(self.panel_width, self.stride, fps=min(30.0, self.speed * self.env.fps / self.stride))
 
 
 # ---- student and teacher ----
@@ -171,17 +173,6 @@ def record_rollouts(config: VizConfig, guided: GuidedStrategy, strength: float) 
 # ---- the command ----
 
 
-def clip_of(rollout: RolloutRecord) -> Clip:
-    """A guided rollout as an animation shows it: the three chunks of the running decision, where they can be drawn."""
-    lines: dict[int, list[Line]] = {}
-    if rollout.to_frame is not None:
-        for decision in rollout.decisions:
-            drawn = [Line(rollout.to_frame(chunk), COLORS[name]) for name, chunk in decision.chunks.items()]
-            n_steps = len(decision.chunks["guided"])
-            lines |= dict.fromkeys(range(decision.step, decision.step + n_steps), drawn)
-    return Clip(rollout.frames, rollout.episode.is_success, lines)
-
-
 def animate_policies(config: VizConfig) -> None:
     """Write `--animation` of the policies that act alone."""
     assert config.animation is not None
@@ -218,7 +209,7 @@ def visualize(config: VizConfig) -> Table:
                 config.png.parent.mkdir(parents=True, exist_ok=True)
                 draw_still(rollout, config.png)
             if config.animation is not None and not config.policies:
-                clips.append(clip_of(rollout))
+                clips.append(guided_clip(rollout))
     if clips and config.animation is not None:
         write_animation({"guided teacher": clips}, config.animation, config.style)
     return table

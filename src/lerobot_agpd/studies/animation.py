@@ -20,8 +20,8 @@ FONT = "DejaVuSans.ttf"  # matplotlib's, which is always there
 BACKGROUND, TEXT = (255, 255, 255), (40, 40, 40)
 SUCCESS, FAILURE = (0, 158, 115), (213, 94, 0)
 BORDER = 4  # pixels
-COLORS = 64
-"""Of a GIF's palette: simulators are plain, and every bit of a pixel costs."""
+COLORS = 128
+"""Of a GIF's palette: simulators are plain, and colors cost bytes."""
 
 PAUSE = 0.8
 """Seconds that a finished episode stays."""
@@ -97,10 +97,9 @@ def write_animation(rows: Mapping[str, Sequence[Clip]], path: Path, style: Style
         return
     # One palette for all frames, taken from all over the film: GIF then stores what changes alone.
     shown = [np.asarray(frame) for frame in frames[:: len(frames) // 8 + 1]]
-    swatches = [
-        np.full_like(shown[0], color) for color in (SUCCESS, FAILURE)
-    ]  # thin borders would get no color
-    palette = Image.fromarray(np.concatenate(shown + swatches)).quantize(COLORS)
+    # What is small and bright, such as a cube or a border, must get a color too; median cut would give it none.
+    swatches = [np.full_like(shown[0][:8], color) for color in (SUCCESS, FAILURE)]
+    palette = Image.fromarray(np.concatenate(shown + swatches)).quantize(COLORS, Image.Quantize.MAXCOVERAGE)
     first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     first.save(
         path, save_all=True, append_images=others, duration=round(1000 / style.fps), loop=0, optimize=True

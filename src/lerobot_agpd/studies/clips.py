@@ -1,4 +1,4 @@
-"""Rendered episodes of policies that act alone, by LeRobot's own rollout."""
+"""Rendered episodes as an animation shows them: of policies that act alone, and of a guided teacher."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from lerobot.utils.random_utils import seeded_context
 
 from lerobot_agpd.loading import load_policy
 from lerobot_agpd.replay.episode import Array
-from lerobot_agpd.studies.animation import Clip, executed_lines
+from lerobot_agpd.studies.animation import Clip, Line, executed_lines
 from lerobot_agpd.studies.evaluation import checkpoint_config
-from lerobot_agpd.studies.recording import COLORS, plane_to_frame, rendered_frame
+from lerobot_agpd.studies.recording import COLORS, RolloutRecord, plane_to_frame, rendered_frame
 
 
 class SoloEnvironment:
@@ -84,3 +84,14 @@ def side_by_side(
     """Episodes of several checkpoints from the same environment seeds, by the checkpoints' names."""
     with closing(SoloEnvironment(env_config, device)) as environment:
         return {name: environment.clips(path, seeds) for name, path in policies.items()}
+
+
+def guided_clip(rollout: RolloutRecord) -> Clip:
+    """A guided rollout as an animation shows it: the three chunks of the running decision, where they can be drawn."""
+    lines: dict[int, list[Line]] = {}
+    if rollout.to_frame is not None:
+        for decision in rollout.decisions:
+            drawn = [Line(rollout.to_frame(chunk), COLORS[name]) for name, chunk in decision.chunks.items()]
+            n_steps = len(decision.chunks["guided"])
+            lines |= dict.fromkeys(range(decision.step, decision.step + n_steps), drawn)
+    return Clip(rollout.frames, rollout.episode.is_success, lines)
