@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from functools import partial
 
@@ -15,6 +16,7 @@ from lerobot_agpd.guidance.strength import STEPS_FLAG, first_strength, require_s
 from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.loading import check_fit, collection_environment, load_teacher, vectors
 from lerobot_agpd.progress import Progress, find_replay_root
+from lerobot_agpd.replay.backgrounds import require_masks
 from lerobot_agpd.replay.demonstrations import DemonstrationFrames
 from lerobot_agpd.replay.export import check_observation
 from lerobot_agpd.replay.frame_features import FrameFeatures
@@ -28,6 +30,7 @@ from lerobot_agpd.rollout.report import RoundReport, read_reports
 from lerobot_agpd.run import RunInfo
 from lerobot_agpd.self_distillation import SelfTeacher
 from lerobot_agpd.student import Student, executed_steps
+from lerobot_agpd.textures import Textures
 
 logger = logging.getLogger(__name__)
 
@@ -100,7 +103,13 @@ def build_parts(
     seen_by_teacher = vectors(teacher.input_features) if teacher else []
     demonstrations = DemonstrationFrames(config, dataset_meta, dataset_stats, seen_by_teacher)
     meta = demonstrations.dataset.meta
-    replay = Replay(demonstrations, config, config.replay.collected_fraction, run.image_transforms)
+    replay = Replay(
+        demonstrations,
+        config,
+        config.replay.collected_fraction,
+        run.image_transforms,
+        _backgrounds(config, meta, env_config),
+    )
     replay.seen_episodes.update(progress.seen_episodes)
     collector, journal = None, None
     if env_config is not None:
@@ -129,6 +138,18 @@ def build_parts(
         seed=seed,
         rank=processes.process_index,
     )
+
+
+def _backgrounds(
+    config: StudentConfig, demonstrations: LeRobotDatasetMetadata, env_config: EnvConfig | None
+) -> Textures | None:
+    if config.replay.backgrounds is None:
+        return None
+    sources: dict[str, Collection[str]] = {"the demonstrations (--dataset.*)": demonstrations.features}
+    if env_config is not None:
+        sources["the observations of the environment (--env.*)"] = env_config.features_map.values()
+    require_masks(list(config.image_features), sources)
+    return Textures(config.replay.backgrounds, "--policy.replay.backgrounds")
 
 
 def _frame_features(student: Student, replay: Replay) -> FrameFeatures | None:
