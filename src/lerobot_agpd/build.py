@@ -156,6 +156,7 @@ def _frame_features(student: Student, replay: Replay) -> FrameFeatures | None:
     encoder, config = student.visual_encoder, student.config
     if encoder is None:
         return None
+    encoder.load()
     return FrameFeatures(replay.frames, list(config.image_features), encoder, replay.demonstrations)
 
 

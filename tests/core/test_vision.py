@@ -1,5 +1,7 @@
 """Students that see cameras: a teacher that sees the state, and J on visual features."""
 
+import shutil
+
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
@@ -203,6 +205,17 @@ def test_a_checkpoint_with_the_students_features_loads_without_anything(start, t
     run.policy.save_pretrained(tmp_path / "checkpoint")
     loaded = AGPDPolicy.from_pretrained(tmp_path / "checkpoint")
     assert set(loaded.state_dict()) == set(run.policy.state_dict())
+
+
+def test_a_student_acts_without_the_dino_that_it_was_trained_with(start, dino, tmp_path, caplog):
+    moved = shutil.copytree(dino, tmp_path / "dino")
+    run = start(representation=RepresentationConfig("visual", str(moved))).train(until=2)
+    run.policy.save_pretrained(tmp_path / "checkpoint")
+    shutil.rmtree(moved)
+    loaded = AGPDPolicy.from_pretrained(tmp_path / "checkpoint")
+    assert loaded.representation is None and "J cannot be computed" in caplog.text
+    batch = run.batch()
+    torch.testing.assert_close(loaded.predict_action_chunk(batch), run.policy.predict_action_chunk(batch))
 
 
 @pytest.mark.parametrize(
