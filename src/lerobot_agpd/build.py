@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -19,6 +20,7 @@ from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.loading import check_fit, collection_environment, load_teacher, vectors
 from lerobot_agpd.progress import REPLAY_FOLDER, Progress, find_replay_root
 from lerobot_agpd.references import References, make_references
+from lerobot_agpd.replay.backgrounds import require_masks
 from lerobot_agpd.replay.chunk_store import FOLDER, ChunkStore
 from lerobot_agpd.replay.demonstrations import DemonstrationFrames
 from lerobot_agpd.replay.export import check_observation
@@ -33,6 +35,7 @@ from lerobot_agpd.rollout.report import RoundReport, read_reports
 from lerobot_agpd.run import RunInfo
 from lerobot_agpd.self_distillation import SelfTeacher
 from lerobot_agpd.student import Student, executed_steps
+from lerobot_agpd.textures import Textures
 
 logger = logging.getLogger(__name__)
 
@@ -108,7 +111,13 @@ def build_parts(
     seen_by_teacher = vectors(teacher.input_features) if teacher else []
     demonstrations = DemonstrationFrames(config, dataset_meta, dataset_stats, seen_by_teacher)
     meta = demonstrations.dataset.meta
-    replay = Replay(demonstrations, config, config.replay.collected_fraction, run.image_transforms)
+    replay = Replay(
+        demonstrations,
+        config,
+        config.replay.collected_fraction,
+        run.image_transforms,
+        _backgrounds(config, meta, env_config),
+    )
     replay.see(progress.seen_episodes)
     collector, journal = None, None
     root = _root(config, run, progress)
@@ -162,10 +171,23 @@ def _require_intact(progress: Progress) -> None:
         )
 
 
+def _backgrounds(
+    config: StudentConfig, demonstrations: LeRobotDatasetMetadata, env_config: EnvConfig | None
+) -> Textures | None:
+    if config.replay.backgrounds is None:
+        return None
+    sources: dict[str, Collection[str]] = {"the demonstrations (--dataset.*)": demonstrations.features}
+    if env_config is not None:
+        sources["the observations of the environment (--env.*)"] = env_config.features_map.values()
+    require_masks(list(config.image_features), sources)
+    return Textures(config.replay.backgrounds, "--policy.replay.backgrounds")
+
+
 def _frame_features(student: Student, replay: Replay) -> FrameFeatures | None:
     encoder, config = student.visual_encoder, student.config
     if encoder is None:
         return None
+    encoder.load()
     return FrameFeatures(replay.frames, list(config.image_features), encoder, replay.demonstrations)
 
 

@@ -302,6 +302,9 @@ class ReplayConfig:
     collected_fraction: float | None = None
     # Frames whose recorded chunks are exchanged for the teacher's own.
     relabel: Relabel = "none"
+    # Another background in every training image, drawn anew each time: noise, stripes or a folder of pictures. Needs masks,
+    # recorded and collected with --env.masks=true. Default: images as they are.
+    backgrounds: str | None = None
 
     def __post_init__(self) -> None:
         require_finite(self, "replay")

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from lerobot_agpd.config import FlagError
 from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS
 from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
 
@@ -82,3 +83,90 @@ def test_shadows_can_be_left_out(make):
     bright = make(obs_type="pixels", task="AdroitHandDoor-v1", shadows=False).reset(seed=0)[0][PIXELS]
     dark = make(obs_type="pixels", task="AdroitHandDoor-v1").reset(seed=0)[0][PIXELS]
     assert bright.mean() > dark.mean()
+
+
+def play(env, seed: int, n_steps: int = 12) -> np.ndarray:
+    """States of an episode of random actions that push the block about."""
+    rng, states = np.random.default_rng(seed), []
+    env.reset(seed=seed)
+    for _ in range(n_steps):
+        env.step(np.array([*rng.uniform(-1, 1, 2), -1.0, 0.0], dtype=np.float32))
+        states.append(np.concatenate(list(env.get_wrapper_attr("state").values())))
+    return np.array(states)
+
+
+def test_an_episode_does_not_depend_on_whether_it_is_looked_at(make):
+    options = {"task": "FetchPickAndPlace-v4", "observation_height": 16, "observation_width": 16}
+    seen = make(**options, obs_type="pixels_environment_state_agent_pos", cameras=["front", "side"])
+    np.testing.assert_array_equal(play(seen, seed=5), play(make(**options), seed=5))
+
+
+def test_the_goal_is_where_it_is_drawn_from_every_camera(make):
+    """Red pixels move with the goal, also at the second image of a state."""
+    env = make(
+        task="FetchPickAndPlace-v4", obs_type="pixels", cameras=["front", "side"], observation_height=96
+    )
+    seen = []
+    for goal in ([1.3, 0.65, 0.6], [1.3, 0.85, 0.6]):
+        env.reset(seed=0)
+        env.unwrapped.goal = np.array(goal)
+        images = [env.observe(*env.spec_of_task.split(env.unwrapped._get_obs()))[PIXELS] for _ in range(2)]
+        for name in ("front", "side"):
+            np.testing.assert_array_equal(images[0][name], images[1][name])
+        image = images[0]["front"].astype(int)
+        red = (image[..., 0] > 120) & (image[..., 1] < 60) & (image[..., 2] < 60)
+        assert red.sum() > 5
+        seen.append(np.argwhere(red)[:, 1].mean())
+    assert abs(seen[0] - seen[1]) > 10
+
+
+# ---- masks and backgrounds ----
+
+SHOWN = {"task": "FetchPickAndPlace-v4", "obs_type": "pixels_agent_pos", "cameras": ["front", "side"]}
+
+
+def test_masks_are_white_where_nothing_can_move(make):
+    env = make(**SHOWN, masks=True, observation_height=96, observation_width=96)
+    observation, _ = env.reset(seed=0)
+    image, mask = observation[PIXELS]["front"].astype(int), observation[PIXELS]["front_mask"]
+    assert set(np.unique(mask)) == {0, 255} and 0.2 < (mask == 255).mean() < 0.95
+    red = (image[..., 0] > 120) & (image[..., 1:] < 60).all(axis=-1)
+    green = (image[..., 1] > 180) & (image[..., 0] < 150)
+    black = (image < 40).all(axis=-1)
+    assert red.any() and not mask[red].any(), "the goal"
+    assert black.any() and (mask[black] == 0).mean() > 0.5, "the block"
+    assert green.any() and (mask[green] == 255).mean() > 0.99, "the wall"
+
+
+def shown(**options) -> list[dict]:
+    env = GymnasiumRoboticsEnv(**SHOWN, observation_height=48, observation_width=48, **options).build()
+    observation, _ = env.reset(seed=3)
+    following = env.step(np.zeros(4, dtype=np.float32))[0]
+    another, _ = env.reset(seed=4)
+    again, _ = env.reset(seed=3)
+    assert env.observation_space.contains(observation)
+    env.close()
+    return [observation, following, another, again]
+
+
+def test_a_background_lasts_for_an_episode_and_follows_from_its_seed(rendering):
+    plain, before = shown(masks=True), shown(background="noise")
+    assert set(before[0][PIXELS]) == {"front", "side"}
+    masks = [each[PIXELS]["front_mask"][..., 0] > 0 for each in plain]
+    pictures = [each[PIXELS]["front"] for each in before]
+    for picture, mask, original in zip(pictures, masks, plain, strict=True):
+        np.testing.assert_array_equal(picture[~mask], original[PIXELS]["front"][~mask])
+    both = masks[0] & masks[1]
+    np.testing.assert_array_equal(pictures[0][both], pictures[1][both])
+    both = masks[0] & masks[2]
+    assert (pictures[0][both] != pictures[2][both]).mean() > 0.5
+    np.testing.assert_array_equal(pictures[0], pictures[3])
+
+
+@pytest.mark.parametrize("options", [{"masks": True}, {"background": "noise"}])
+def test_masks_belong_to_named_cameras(options):
+    (name,) = options
+    with pytest.raises(FlagError, match=f"--env.{name}=.*--env.cameras"):
+        GymnasiumRoboticsEnv(obs_type="pixels_agent_pos", **options)
+    with pytest.raises(FlagError, match="--env.background=/nowhere must be one of noise"):
+        GymnasiumRoboticsEnv(**SHOWN, background="/nowhere")

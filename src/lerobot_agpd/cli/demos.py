@@ -120,7 +120,7 @@ def record_demos(config: DemosConfig) -> DemosReport:
     def add_report(folder: Path) -> None:
         (folder / REPORT_PATH).write_text(json.dumps(asdict(report), indent=2) + "\n")
 
-    env = config.env.make_single()
+    env = config.env.build()
     episodes = successful_episodes(
         env,
         config.make_expert(),

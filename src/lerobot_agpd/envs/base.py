@@ -12,12 +12,8 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_IMAGES, OBS_STATE
 
 from lerobot_agpd.config import require
-from lerobot_agpd.envs.poses import CameraPose
-
-AGENT_POS = "agent_pos"
-ENVIRONMENT_STATE = "environment_state"
-PIXELS = "pixels"
-"""Raw keys that LeRobot's `preprocess_observation` turns into its own."""
+from lerobot_agpd.envs.view import AGENT_POS, ENVIRONMENT_STATE, PIXELS, TaskSpec, View
+from lerobot_agpd.textures import Textures, mask_of
 
 OBSERVED_KEYS: dict[str, tuple[str, ...]] = {
     "state": (AGENT_POS, ENVIRONMENT_STATE),
@@ -34,52 +30,6 @@ DESCRIPTIONS = {
     "gym_aloha/AlohaTransferCube-v0": "Pick up the cube with the right arm and hand it to the left arm.",
 }
 """Task descriptions of gymnasium's environments that have none of their own."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TaskSpec:
-    """Properties of one task.
-
-    Attributes:
-        description: one sentence, LeRobot's `task_description`.
-        fps: control steps per second of simulated time, rounded down.
-        episode_length: steps after which an episode is truncated by default.
-        action_dim: length of an action.
-        agent_pos_dim: length of `agent_pos`.
-        environment_state_dim: length of `environment_state`.
-    """
-
-    description: str
-    fps: int
-    episode_length: int
-    action_dim: int
-    agent_pos_dim: int
-    environment_state_dim: int
-
-
-@dataclass(frozen=True)
-class View:
-    """What an environment shows; sizes of images are (height, width) in pixels.
-
-    Attributes:
-        keys: observed raw keys.
-        cameras: cameras whose images are observed, each under its name; none: one image without a name.
-        observation_size: of observed images.
-        visualization_size: of rendered frames.
-        shadows: whether images show them; without a GPU they take most of the time.
-        antialiasing: whether edges are smooth; without a GPU images take a third of the time without.
-        poses: of those cameras that are not the model's.
-        main_pose: of rendered frames, and of an observed image without a name; None: the environment's own.
-    """
-
-    keys: tuple[str, ...] = (AGENT_POS, ENVIRONMENT_STATE)
-    cameras: tuple[str, ...] = ()
-    observation_size: tuple[int, int] = (96, 96)
-    visualization_size: tuple[int, int] = (480, 480)
-    shadows: bool = True
-    antialiasing: bool = True
-    poses: Mapping[str, CameraPose] = field(default_factory=dict)
-    main_pose: CameraPose | None = None
 
 
 def require_choice(option: str, value: str | list[str] | None, choices: Iterable[str]) -> None:
@@ -107,6 +57,7 @@ class SimulatedEnvConfig(EnvConfig):
         "pixels",
         "pixels_environment_state_agent_pos",
     )
+    has_masks: ClassVar[bool] = True
 
     # Control steps per second; default: the task's, the only possible value.
     fps: int | None = None
@@ -126,6 +77,11 @@ class SimulatedEnvConfig(EnvConfig):
     shadows: bool = True
     # Smooth edges; without a GPU an image takes a third of the time without.
     antialiasing: bool = True
+    # Show masks too, one image per camera, <camera>_mask: white where nothing can move.
+    masks: bool = False
+    # Another background in every episode, where nothing can move: noise, stripes or a folder of pictures; default: the
+    # simulation's own.
+    background: str | None = None
     # gymnasium's render mode, rgb_array; nothing is rendered before `render` is called.
     render_mode: str = "rgb_array"
     # Derived from the task.
@@ -154,11 +110,25 @@ class SimulatedEnvConfig(EnvConfig):
             f"--env.observation_height={self.observation_height} and --env.observation_width="
             f"{self.observation_width} must be at least 4 pixels",
         )
+        self._check_masks()
         self._set_features()
+
+    def _check_masks(self) -> None:
+        shows_cameras = bool(self.observed_cameras) and PIXELS in OBSERVED_KEYS[self.obs_type]
+        for option in ("masks", "background"):
+            value = getattr(self, option)
+            require(
+                not value or (shows_cameras and self.has_masks),
+                f"--env.{option}={value}: --env.type={self.type} has masks for named cameras alone, of MuJoCo; choose some "
+                "with --env.cameras and show them (--env.obs_type)",
+            )
+        if self.background is not None:
+            Textures(self.background, "--env.background")
 
     def _set_features(self) -> None:
         view = self.view
-        images = {f"{PIXELS}/{camera}": f"{OBS_IMAGES}.{camera}" for camera in view.cameras}
+        names = [*view.cameras, *(mask_of(camera) for camera in view.cameras if self.masks)]
+        images = {f"{PIXELS}/{name}": f"{OBS_IMAGES}.{name}" for name in names}
         images = (images or {PIXELS: OBS_IMAGE}) if PIXELS in view.keys else {}
         vectors = {
             AGENT_POS: PolicyFeature(FeatureType.STATE, (self.spec.agent_pos_dim,)),
@@ -202,11 +172,12 @@ class SimulatedEnvConfig(EnvConfig):
             (self.visualization_height, self.visualization_width),
             self.shadows,
             self.antialiasing,
+            masks=self.masks or self.background is not None,
         )
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Nothing: `make_single` builds the environments, not LeRobot by an id."""
+        """Nothing: `build` builds the environments, not LeRobot by an id."""
         return {}
 
     @abstractmethod
@@ -216,6 +187,15 @@ class SimulatedEnvConfig(EnvConfig):
         Raises:
             ModuleNotFoundError: if the package of the simulation is not installed.
         """
+
+    def build(self) -> gym.Env:
+        """Build one environment as it is shown: that of `make_single`, before another background if there is one."""
+        env = self.make_single()
+        if self.background is None:
+            return env
+        from lerobot_agpd.envs.backgrounds import Backgrounds
+
+        return Backgrounds(env, Textures(self.background, "--env.background"), keep_masks=self.masks)
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
         """Build a vector environment as LeRobot's own configurations do, autoreset in the same step.
@@ -233,7 +213,7 @@ class SimulatedEnvConfig(EnvConfig):
         Raises:
             ModuleNotFoundError: if the package of the simulation is not installed.
         """
-        factories = [self.make_single] * n_envs  # picklable: workers import this package
+        factories = [self.build] * n_envs  # picklable: workers import this package
         mode = AutoresetMode.SAME_STEP
         if use_async_envs and n_envs > 1:
             env: VectorEnv = AsyncVectorEnv(factories, context="forkserver", autoreset_mode=mode)

@@ -30,6 +30,7 @@ class PushTStateEnvConfig(SimulatedEnvConfig):
     """Push-T, seen through corners and the agent's position, or through an image too."""
 
     tasks = TASKS
+    has_masks = False
     obs_types = (
         "environment_state_agent_pos",
         "pixels_agent_pos",

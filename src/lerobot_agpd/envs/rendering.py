@@ -15,6 +15,7 @@ import numpy as np
 
 from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS, TaskSpec, View
 from lerobot_agpd.envs.poses import CameraPose
+from lerobot_agpd.textures import mask_of
 
 type Camera = mujoco.MjvCamera | int | str
 """A camera, or the number or name of one of the model's."""
@@ -74,6 +75,22 @@ class SceneRenderer:
         renderer.update_scene(data, camera, self._option)
         return renderer.render()
 
+    def background(
+        self, model: mujoco.MjModel, data: mujoco.MjData, camera: Camera, size: tuple[int, int]
+    ) -> np.ndarray:
+        """Mask (height, width, 3) in uint8 of the image that was rendered last: 255 where nothing can move.
+
+        That is the sky, and geometry that is welded to the world.
+        """
+        renderer = self.renderers[size]
+        renderer.enable_segmentation_rendering()
+        renderer.update_scene(data, camera, self._option)
+        number, kind = np.moveaxis(renderer.render(), -1, 0)
+        renderer.disable_segmentation_rendering()
+        fixed = model.body_weldid[model.geom_bodyid] == 0  # (geometries,)
+        is_background = (kind == -1) | ((kind == mujoco.mjtObj.mjOBJ_GEOM) & fixed[number])
+        return np.repeat(np.uint8(255) * is_background[..., None], 3, axis=-1)
+
     def close(self) -> None:
         """Free the graphics contexts; the next image opens one again."""
         for renderer in self.renderers.values():
@@ -109,10 +126,11 @@ class ViewedEnv(gym.Env):
         if view.main_pose is not None:
             self.main_camera = free_camera(view.main_pose)
         image = gym.spaces.Box(0, 255, (*view.observation_size, 3), np.uint8)
+        names = [*view.cameras, *(mask_of(camera) for camera in view.cameras if view.masks)]
         spaces: dict[str, gym.Space] = {
             AGENT_POS: gym.spaces.Box(-np.inf, np.inf, (spec.agent_pos_dim,), np.float32),
             ENVIRONMENT_STATE: gym.spaces.Box(-np.inf, np.inf, (spec.environment_state_dim,), np.float32),
-            PIXELS: gym.spaces.Dict(dict.fromkeys(view.cameras, image)) if view.cameras else image,
+            PIXELS: gym.spaces.Dict(dict.fromkeys(names, image)) if names else image,
         }
         self.observation_space = gym.spaces.Dict({key: spaces[key] for key in view.keys})
 
@@ -123,7 +141,12 @@ class ViewedEnv(gym.Env):
         observation: dict[str, Any] = {key: self.state[key] for key in self.view.keys if key != PIXELS}
         if PIXELS in self.view.keys:
             size = self.view.observation_size
-            images = {name: self._image(self.cameras.get(name, name), size) for name in self.view.cameras}
+            images: dict[str, np.ndarray] = {}
+            for name in self.view.cameras:
+                camera = self.cameras.get(name, name)
+                images[name] = self._image(camera, size)
+                if self.view.masks:
+                    images[mask_of(name)] = self.scene_renderer.background(*self.scene(), camera, size)
             observation[PIXELS] = images or self._image(self.main_camera, size)
         return observation
 

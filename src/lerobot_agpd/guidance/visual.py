@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,10 @@ class VisualEncoder(ABC):
     dim: int
     is_frozen: bool
 
+    @abstractmethod
+    def load(self) -> None:
+        """Load now what would be loaded at the first use."""
+
     @torch.no_grad()
     def encode(self, images: Mapping[str, Tensor], normalize: Normalize) -> Tensor:
         """Features (B, N * F) of the cameras' images (B, C, H, W) in [0, 1]: every token with mean 0 and variance 1.
@@ -74,29 +79,44 @@ class DinoEncoder(VisualEncoder):
     is_frozen = True
 
     def __init__(self, name: str, cameras: tuple[str, ...], device: str):
-        from transformers import Dinov2Model  # takes seconds, and few runs need it
+        from transformers import Dinov2Config  # takes seconds, and few runs need it
 
+        self.name, self.cameras, self.device = name, cameras, device
+        config: Any = self._read(Dinov2Config)
+        self.patch_size = int(config.patch_size)
+        self.n_tokens, self.dim = MAP_SIZE**2 * len(cameras), int(config.hidden_size)
+
+    @cached_property
+    def model(self) -> Any:
+        """The network, loaded when it is first used: to act, a student does not need it."""
+        from transformers import Dinov2Model
+
+        return self._read(Dinov2Model).to(self.device).eval().requires_grad_(False)
+
+    def load(self) -> None:
+        """Load the network."""
+        _ = self.model
+
+    def _read(self, kind: Any) -> Any:
         try:
-            model: Any = Dinov2Model.from_pretrained(name)
+            return kind.from_pretrained(self.name)
         except (OSError, ValueError) as error:
+            is_folder = Path(self.name).is_dir()
             where = (
                 "has no such model"
-                if Path(name).is_dir()
+                if is_folder
                 else "is neither a folder nor a Hub repository that can be reached"
             )
             raise FlagError(
-                f"--policy.representation.encoder='{name}' {where} ({str(error).splitlines()[0]}); name a Dinov2Model of "
-                f"transformers, such as facebook/dinov2-small, or '{STUDENT}' for the student's own features"
+                f"--policy.representation.encoder='{self.name}' {where} ({str(error).splitlines()[0]}); name a Dinov2Model "
+                f"of transformers, such as facebook/dinov2-small, or '{STUDENT}' for the student's own features"
             ) from error
-        self.model = model.to(device).eval().requires_grad_(False)
-        self.cameras, self.device = cameras, device
-        self.n_tokens, self.dim = MAP_SIZE**2 * len(cameras), int(model.config.hidden_size)
 
     def _tokens(self, images: Mapping[str, Tensor], normalize: Normalize) -> Tensor:
         return torch.cat([self._camera_tokens(images[key].to(self.device)) for key in self.cameras], dim=1)
 
     def _camera_tokens(self, images: Tensor) -> Tensor:
-        patch = int(self.model.config.patch_size)
+        patch = self.patch_size
         height, width = (
             min(math.ceil(size / patch), max(MAX_IMAGE_SIZE // patch, 1)) * patch
             for size in images.shape[-2:]

@@ -75,7 +75,9 @@ class DistilledPolicy(CardedPolicy, Student):
         self.discriminator = None
         if config.adversary.weight > 0:
             self.discriminator = Discriminator(config.future_steps, action_dim, self.embedding_dim)
-        self.representation, self.visual_encoder = make_representation(self)
+        self.representation, self.visual_encoder = make_representation(
+            self, is_trained=dataset_meta is not None
+        )
         self._gradient_norms = GradientNorms(self.parameter_groups())
         self._last_norms: dict[str, float] = {}
         is_lerobots, run = run is None, run or RunInfo.of(config)

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from lerobot_agpd.config import StudentConfig, require
+from lerobot_agpd.config import FlagError, StudentConfig, require
 from lerobot_agpd.guidance.representation import StateRepresentation
 from lerobot_agpd.guidance.visual import STUDENT, DinoEncoder, Normalize, VisualEncoder
 
 if TYPE_CHECKING:
     from lerobot_agpd.student import Student
+
+logger = logging.getLogger(__name__)
 
 
 class StudentFeatures(VisualEncoder):
@@ -34,6 +37,9 @@ class StudentFeatures(VisualEncoder):
         with torch.no_grad():
             _, self.n_tokens, self.dim = self._tokens(blank, lambda key, images: images).shape
 
+    def load(self) -> None:
+        """Nothing: the student is there."""
+
     def _tokens(self, images: Mapping[str, Tensor], normalize: Normalize) -> Tensor:
         images = {key: normalize(key, values) for key, values in images.items()}
         was_training = self.student.training
@@ -44,11 +50,18 @@ class StudentFeatures(VisualEncoder):
             self.student.train(was_training)
 
 
-def make_representation(student: Student) -> tuple[StateRepresentation | None, VisualEncoder | None]:
+def make_representation(
+    student: Student, is_trained: bool
+) -> tuple[StateRepresentation | None, VisualEncoder | None]:
     """The representation of a student's configuration, and what makes features of images for it.
 
+    Args:
+        student: whose configuration counts.
+        is_trained: whether it is built to be trained. A trained one acts without: where the encoder cannot be found, there
+            is no representation.
+
     Raises:
-        FlagError: if the student does not see what it needs.
+        FlagError: if the student does not see what it needs, or the encoder cannot be found.
     """
     config = student.config
     if config.representation.type == "action":
@@ -57,7 +70,13 @@ def make_representation(student: Student) -> tuple[StateRepresentation | None, V
     action_dim, n_steps = config.action_feature.shape[0], config.collect.n_action_steps or config.n_execute
     if config.representation.type == "state":
         return StateRepresentation(_state_dim(config), action_dim, n_steps), None
-    encoder = _visual_encoder(student)
+    try:
+        encoder = _visual_encoder(student)
+    except FlagError as error:
+        if is_trained:
+            raise
+        logger.warning("the student acts, but its discrepancy J cannot be computed: %s", error)
+        return None, None
     dim = encoder.n_tokens * encoder.dim
     return StateRepresentation(dim, action_dim, n_steps, encoder.n_tokens), encoder
 

@@ -12,12 +12,14 @@ import torch
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
+from lerobot_agpd.replay.backgrounds import replace_backgrounds
 from lerobot_agpd.replay.demonstrations import Batch, DemonstrationFrames
 from lerobot_agpd.replay.frame_features import FrameFeatures
 from lerobot_agpd.replay.frames import ChunkStarts
 from lerobot_agpd.replay.gate import FarValues
 from lerobot_agpd.replay.images import RecordedFrames, as_floats
 from lerobot_agpd.replay.stored import StoredEpisode
+from lerobot_agpd.textures import Textures, mask_of
 
 logger = logging.getLogger(__name__)
 
@@ -74,6 +76,7 @@ class Replay:
         collected_fraction: fraction of every batch that is exchanged; None draws uniformly from T.
         image_transforms: what the loader applies to training images (..., C, H, W) in [0, 1]; T applies it to those
             that it reads itself.
+        backgrounds: of training images; None: those that were recorded.
     """
 
     def __init__(
@@ -82,12 +85,13 @@ class Replay:
         config: BatchConfig,
         collected_fraction: float | None,
         image_transforms: Callable[[Tensor], Tensor] | None = None,
+        backgrounds: Textures | None = None,
     ):
         self.demonstrations = demonstrations
         self.table = demonstrations.table
         self.frames = RecordedFrames(demonstrations.dataset, self.table)
         self.config = config
-        self.image_transforms = image_transforms
+        self.image_transforms, self.backgrounds = image_transforms, backgrounds
         self._far_values = FarValues()
         self.n_demonstrations = len(self.table.lengths)
         self.n_demonstration_frames = len(self.table)
@@ -164,7 +168,8 @@ class Replay:
             positions = torch.randint(len(self._collected_starts), (n_exchanged,), generator=generator)
             drawn = self._collected_starts.frames(positions)
             frame_index[exchanged.to(frame_index.device)] = drawn.to(frame_index)
-        return self._gather(batch, frame_index, augment=True)
+        rng = np.random.default_rng(int(torch.randint(2**31, (), generator=generator)))
+        return self._gather(batch, frame_index, rng)
 
     def starts(self) -> Tensor:
         """Frames that begin a chunk: those of the seen demonstrations, then the collected ones."""
@@ -192,19 +197,31 @@ class Replay:
         self.demonstrations.observe(batch)
         return self._gather(batch, batch["index"])
 
-    def _gather(self, batch: Batch, frame_index: Tensor, augment: bool = False) -> Batch:
+    def _gather(self, batch: Batch, frame_index: Tensor, rng: np.random.Generator | None = None) -> Batch:
         gathered = self.demonstrations.gather_batch(
             frame_index, self.config.chunk_delta_indices, self.config.history_length
         )
-        images = self._images(batch, frame_index, augment)
+        images = self._images(batch, frame_index, rng)
         return {**images, **gathered, FRAME_INDEX: frame_index}
 
-    def _images(self, batch: Batch, frame_index: Tensor, augment: bool) -> Batch:
-        """Normalized camera frames; those that the loader did not deliver are T's own."""
+    def _images(self, batch: Batch, frame_index: Tensor, rng: np.random.Generator | None) -> Batch:
+        """Normalized camera frames; those that the loader did not deliver are T's own.
+
+        In training, where there is an `rng`, they are augmented: transformed, and before other backgrounds.
+        """
+        augment = rng is not None
         if not self._cameras:
             return {}
-        if self.config.history_length is not None:
-            histories = self.frames.images(frame_index, self._cameras, self.config.history_length)
+        n_obs_steps = self.config.history_length
+        if rng is not None and self.backgrounds is not None:
+            read = self.frames.images(
+                frame_index, [*self._cameras, *map(mask_of, self._cameras)], n_obs_steps
+            )
+            for key in self._cameras:
+                read[key] = replace_backgrounds(read[key], read[mask_of(key)], self.backgrounds, rng)
+            return {key: self._normalized(key, read[key], batch[key], augment) for key in self._cameras}
+        if n_obs_steps is not None:
+            histories = self.frames.images(frame_index, self._cameras, n_obs_steps)
             return {key: self._normalized(key, histories[key], batch[key], augment) for key in self._cameras}
         images = {key: batch[key] for key in self._cameras}
         exchanged = frame_index != batch["index"]

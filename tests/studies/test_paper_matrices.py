@@ -1,0 +1,59 @@
+"""The paper's tables: every cell is expanded and its command parsed as lerobot-train does."""
+
+from pathlib import Path
+
+import pytest
+
+from lerobot_agpd.plugin import ENV_TYPES
+from lerobot_agpd.studies.matrix import load_matrix
+from lerobot_agpd.studies.parsing import parse_train_flags
+from lerobot_agpd.studies.runs import check, expand
+
+ROOT = Path(__file__).parents[2]
+CELLS = {"table1": 4 * 4, "table2": 12 * 4 + 12, "table3": 8 * 4 + 8, "table4": 2 * 5 + 2}
+"""Cells of a table, the teachers' own included."""
+
+
+@pytest.fixture(params=CELLS)
+def table(request, tmp_path, monkeypatch):
+    """A matrix, and its runs with one seed."""
+    monkeypatch.setenv("AGPD_RUNS", str(tmp_path))
+    monkeypatch.chdir(ROOT)
+    matrix = load_matrix(ROOT / "benchmarks/paper" / f"{request.param}.yaml")
+    return request.param, matrix, expand(matrix, seeds=matrix.seeds[:1])
+
+
+def test_every_cell_is_there_once(table):
+    name, matrix, runs = table
+    assert len(runs) == len({(run.task, run.method) for run in runs}) == CELLS[name]
+    assert (
+        len(matrix.seeds) == 3
+        and matrix.evaluation.episodes == 500
+        and matrix.evaluation.curve_episodes == 22
+    )
+
+
+def test_every_command_parses(table):
+    _, matrix, runs = table
+    for run in runs:  # what the README says how to make
+        for path in (run.flags.get("dataset.root"), run.flags.get("policy.teacher.path"), run.policy):
+            if path:
+                Path(path).mkdir(parents=True, exist_ok=True)
+    check(matrix, runs)
+
+
+def test_methods_and_modalities_are_what_they_are_called(table):
+    name, matrix, runs = table
+    for run in (run for run in runs if not run.policy):
+        config = parse_train_flags(run.args)
+        collect, adversary = config.policy.collect, config.policy.adversary
+        assert config.env.type in ENV_TYPES and ("pixels" in config.env.obs_type) == run.task.endswith(
+            "vision"
+        )
+        assert (config.dataset.episodes == list(range(20))) == ("few" in run.task)
+        assert collect.enabled == (run.method not in ("dp_t", "dp_c", "discriminator"))
+        assert (adversary.weight > 0) == (run.method in ("agpd", "discriminator"))
+        assert config.policy.denoiser == ("unet" if name == "table1" else "transformer")
+        guided = run.method in ("agpd", "guided_pd")
+        assert not collect.enabled or (collect.strategy == "guided") == guided
+        assert bool(config.policy.teacher.path) == (name != "table1" and run.method != "dp_t")
