@@ -451,4 +451,4 @@ def _decode_checkpoint(
             "concern training, not what the policy does",
             unknown,
         )
-    return decode_dataclass(cls, content, path)  # type: ignore[no-any-return]
+    return decode_dataclass(cls, content, path)

@@ -55,7 +55,7 @@ class EpisodeTable:
             episode_index=self.meta.total_episodes,
             episode_length=len(rows),
             episode_tasks=list(dict.fromkeys(tasks)),
-            episode_stats=compute_episode_stats(columns, self.meta.features),
+            episode_stats=compute_episode_stats({**columns}, self.meta.features),
             episode_metadata={
                 "data/chunk_index": chunk_index,
                 "data/file_index": file_index,

@@ -187,8 +187,9 @@ class Replay:
         length, device = self.config.history_length, self.demonstrations.device
         gathered = self.demonstrations.gather_batch(frame_index, self.config.chunk_delta_indices, length)
         histories = self.history(frame_index, self._cameras, length or 1) if self._cameras else {}
+        like = torch.empty(0, device=device)
         for key in self._cameras:
-            images = self._normalized(key, histories[key], augment=False).to(device)
+            images = self._normalized(key, histories[key], like, augment=False)
             gathered[key] = images[:, 0] if length is None else images
         return {**gathered, FRAME_INDEX: frame_index.to(device)}
 

@@ -25,7 +25,9 @@ class ServedFrames:
     """
 
     def __init__(self, dataset: LeRobotDataset):
-        first, frames = dataset[0], dataset.hf_dataset.with_format("numpy")[:]
+        first = dataset[0]
+        assert isinstance(first, dict)  # for one index
+        frames = dataset.hf_dataset.with_format("numpy")[:]
         self.columns = {
             key: torch.as_tensor(frames[key]).to(value.dtype).reshape(-1, *value.shape)
             for key, value in first.items()
