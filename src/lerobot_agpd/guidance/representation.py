@@ -51,11 +51,22 @@ class StateRepresentation(nn.Module):
     def encode(self, observation: Tensor, actions: Tensor) -> Tensor:
         """The latent z = E(O, A), (B, L), for observations (B, D) and executed steps (B, n, A)."""
         tokens = torch.cat([self.observation_token(observation)[:, None], self.action_token(actions)], dim=1)
-        return self.to_latent(self.encoder(tokens + self.position[: tokens.shape[1]])[:, 0])
+        tokens = tokens + self.position[: tokens.shape[1]]
+        *layers, last = self.encoder.layers
+        for layer in layers:
+            tokens = layer(tokens)
+        return self.to_latent(_first_token(last, tokens))
 
     def forward(self, observation: Tensor, actions: Tensor) -> Tensor:
         """The predicted observation after the executed steps, (B, D)."""
         return observation + self.decoder(self.encode(observation, actions))
+
+
+def _first_token(layer: nn.Module, tokens: Tensor) -> Tensor:
+    """The first output token (B, W) of a nn.TransformerEncoderLayer with norm_first, without computing the others."""
+    normed = layer.norm1(tokens)
+    first = tokens[:, 0] + layer.self_attn(normed[:, :1], normed, normed, need_weights=False)[0][:, 0]
+    return first + layer.linear2(layer.activation(layer.linear1(layer.norm2(first))))
 
 
 def reconstruction_loss(predicted: Tensor, future: Tensor, is_pad: Tensor) -> Tensor:
