@@ -23,7 +23,9 @@ from lerobot_agpd.studies.provenance import provenance
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--sections", default=",".join(SECTIONS), help="part of the sections")
+    parser.add_argument(
+        "--sections", default=",".join(SECTIONS), help="a part, which replaces that part of the file"
+    )
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--output", type=Path)
@@ -31,24 +33,28 @@ def main() -> None:
     torch.set_num_threads(options.threads)
     register_third_party_plugins()
     logging.disable(logging.WARNING)
+    path = options.output or Path(__file__).with_name(f"speed-{options.device}.json")
+    chosen = options.sections.split(",")
+    earlier = (
+        json.loads(path.read_text())["sections"] if path.exists() and len(chosen) < len(SECTIONS) else {}
+    )
     content = {
         **provenance(),
         "device": torch.cuda.get_device_name() if options.device == "cuda" else "cpu",
         "threads": options.threads,
-        "load": os.getloadavg()[0],
-        "sections": {},
+        "sections": earlier,
     }
-    for name in options.sections.split(","):
+    for name in chosen:
         began = time.perf_counter()
         rows = SECTIONS[name](options.device)
-        content["sections"][name] = {"seconds": time.perf_counter() - began, "rows": rows}
-        print(f"{name} ({time.perf_counter() - began:.0f} s)")
+        seconds = time.perf_counter() - began
+        content["sections"][name] = {"seconds": seconds, "load": os.getloadavg()[0], "rows": rows}
+        path.write_text(json.dumps(content, indent=1) + "\n")
+        print(f"{name} ({seconds:.0f} s)")
         for row, values in rows.items():
             print(
                 f"  {row:48s}", *(f"{key} {value:.4g}" for key, value in values.items()), sep="  ", flush=True
             )
-    path = options.output or Path(__file__).with_name(f"speed-{options.device}.json")
-    path.write_text(json.dumps(content, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -46,7 +46,13 @@ from lerobot_agpd.config import CollectConfig, GuidanceConfig, StudentConfig
 from lerobot_agpd.continuation import announcement
 from lerobot_agpd.guidance.guide import Guide
 from lerobot_agpd.guidance.representation import WEIGHT, reconstruction_loss
-from lerobot_agpd.guidance.strength import first_strength, guidance_scale, guidance_scales, largest_strength
+from lerobot_agpd.guidance.strength import (
+    first_strength,
+    guidance_scale,
+    guidance_scales,
+    largest_strength,
+    next_strength,
+)
 from lerobot_agpd.guidance.teacher import History
 from lerobot_agpd.guidance.teacher_student import TeacherStudent
 from lerobot_agpd.replay.demonstrations import Batch
@@ -67,15 +73,6 @@ from lerobot_agpd.rollout.success import classify
 from lerobot_agpd.student import PriorChunk, Student, StudentSampler
 
 logger = logging.getLogger(__name__)
-
-GROWTH = 2.0
-"""Factor by which the strength of guidance grows after a good round and shrinks after a bad one."""
-
-TOLERANCE = 0.05
-"""How far the guided teacher's success rate may fall below its own in a good round."""
-
-MIN_STRENGTH = 0.05
-"""An adapted strength, be it a pull or a guidance scale, never falls below this."""
 
 ADVERSARY_LOG = ("discriminator_loss", "adversarial_loss", "discriminator_accuracy")
 
@@ -125,37 +122,6 @@ def make_strategy(config: StudentConfig, pair: TeacherStudent, generator: torch.
     return RollInStrategy(guided) if config.collect.strategy == "rollin" else guided
 
 
-def next_strength(
-    strength: float,
-    guided_success: float | None,
-    teacher_success: float | None,
-    config: GuidanceConfig,
-    reachable: float = math.inf,
-) -> float:
-    """Pull (or guidance scale) of the next round: the "adaptive" in AGPD.
-
-    A round is good if guided episodes succeed as often as the teacher's own, up to TOLERANCE; then the strength grows
-    by GROWTH, else it shrinks by the same factor. While the student is weak its pull costs success and the strength
-    stays small; as the student improves the strength rises. Where nothing succeeds nothing is known, and it stays.
-
-    Args:
-        strength: of the finished round.
-        guided_success: success rate of its guided episodes, None if there were none.
-        teacher_success: success rate of the teacher alone, None if unknown.
-        config: upper limit; a first strength beyond a limit only ever moves back toward it.
-        reachable: the largest strength that the teacher's sampler can follow.
-    """
-    if guided_success is None or teacher_success is None:
-        return strength
-    if not config.adaptive or config.first_strength == 0:
-        return strength
-    if guided_success == teacher_success == 0:
-        return strength
-    if guided_success >= teacher_success - TOLERANCE:
-        return max(strength, min(strength * GROWTH, config.max_strength, reachable))
-    return min(strength, max(strength / GROWTH, MIN_STRENGTH))
-
-
 def rounds_due(step: int, config: CollectConfig) -> int:
     """Rounds that are due after a number of training steps: the first after the warm-up, then one every `every`."""
     if not config.enabled or step < config.warmup:
@@ -193,6 +159,7 @@ class AGPD:
         self.collector, self.journal = parts.collector, parts.journal
         self.seed, self.rank = parts.seed, parts.rank
         self.reports = list(parts.reports)
+        self._round_log = round_scalars(self.reports)
         self._micro_batch = 0  # since the last update, if gradients are accumulated
 
     # ---- the alternation ----
@@ -223,6 +190,7 @@ class AGPD:
         self.replay.extend(self.journal.kept(number))  # T += episodes
         self.reports.append(read_reports(self.journal.root)[number])
         self.progress.rounds = len(self.reports)
+        self._round_log = round_scalars(self.reports)
         if PartialState().is_main_process:
             log_round(self.reports[-1], again)
         return self.reports[-1]
@@ -352,7 +320,7 @@ class AGPD:
             discriminator: D.
         """
         total = torch.zeros((), device=batch[ACTION].device)
-        log = {"collected_fraction": self.replay.collected_fraction} | round_scalars(self.reports)
+        log = {"collected_fraction": self.replay.collected_fraction} | self._round_log
         if reference is not None:
             # LeRobot averages over processes by position: every one needs the same keys.
             log |= dict.fromkeys(ADVERSARY_LOG, 0.0)

@@ -3,8 +3,9 @@
 import pytest
 from hypothesis import given, strategies as st
 
-from lerobot_agpd.agpd import GROWTH, MIN_STRENGTH, TOLERANCE, next_strength, rounds_due
+from lerobot_agpd.agpd import rounds_due
 from lerobot_agpd.config import DEFAULT_PULL, CollectConfig, FlagError, GuidanceConfig
+from lerobot_agpd.guidance.strength import GROWTH, MIN_STRENGTH, TOLERANCE, next_strength
 
 
 def steps_of_rounds(last=40, **options):

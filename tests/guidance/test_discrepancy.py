@@ -110,3 +110,11 @@ def test_representation_predicts_a_change_and_sees_every_step():
     torch.testing.assert_close(predicted - observation, model.decoder(model.encode(observation, actions)))
     predicted.sum().backward()
     assert (actions.grad.abs().sum(dim=2) > 0).all()
+
+
+def test_the_latent_is_the_encoders_first_token():
+    model = StateRepresentation(D, A, N)
+    observation, actions = torch.randn(B, D), torch.randn(B, N, A)
+    tokens = torch.cat([model.observation_token(observation)[:, None], model.action_token(actions)], dim=1)
+    whole = model.encoder(tokens + model.position)
+    torch.testing.assert_close(model.encode(observation, actions), model.to_latent(whole[:, 0]))

@@ -55,11 +55,24 @@ class StateRepresentation(nn.Module):
         """The latents z = E(O, A), (B, N, L), for observations (B, D) and executed steps (B, n, A)."""
         observed = self.observation_token(observation.unflatten(1, (self.n_tokens, -1)))
         tokens = torch.cat([observed, self.action_token(actions)], dim=1)
-        return self.to_latent(self.encoder(tokens + self.position[: tokens.shape[1]])[:, : self.n_tokens])
+        tokens = tokens + self.position[: tokens.shape[1]]
+        *layers, last = self.encoder.layers
+        for layer in layers:
+            tokens = layer(tokens)
+        return self.to_latent(_first_tokens(last, tokens, self.n_tokens))
 
     def forward(self, observation: Tensor, actions: Tensor) -> Tensor:
         """The predicted observation after the executed steps, (B, D)."""
         return observation + self.decoder(self.encode(observation, actions)).flatten(1)
+
+
+def _first_tokens(layer: nn.Module, tokens: Tensor, n_tokens: int) -> Tensor:
+    """The first output tokens (B, N, W) of a nn.TransformerEncoderLayer with norm_first; the others are not computed."""
+    normed = layer.norm1(tokens)
+    first = (
+        tokens[:, :n_tokens] + layer.self_attn(normed[:, :n_tokens], normed, normed, need_weights=False)[0]
+    )
+    return first + layer.linear2(layer.activation(layer.linear1(layer.norm2(first))))
 
 
 def reconstruction_loss(predicted: Tensor, future: Tensor, is_pad: Tensor) -> Tensor:

@@ -17,11 +17,51 @@ STEPS_FLAG = "--policy.teacher.num_inference_steps"
 WEAKEST_PULL = 0.1
 """A teacher that the default cannot pull at least so far is refused."""
 
+GROWTH = 2.0
+"""Factor by which the strength of guidance grows after a good round and shrinks after a bad one."""
+
+TOLERANCE = 0.05
+"""How far the guided teacher's success rate may fall below its own in a good round."""
+
+MIN_STRENGTH = 0.05
+"""An adapted strength, be it a pull or a guidance scale, never falls below this."""
+
 
 def first_strength(teacher: Teacher, config: GuidanceConfig) -> float:
     """Strength of the first round: what the flags say, or as much of the default pull as the sampler can follow."""
     asked = config.first_strength
     return max(min(asked, largest_strength(teacher, config)), WEAKEST_PULL) if config.is_default else asked
+
+
+def next_strength(
+    strength: float,
+    guided_success: float | None,
+    teacher_success: float | None,
+    config: GuidanceConfig,
+    reachable: float = math.inf,
+) -> float:
+    """Pull (or guidance scale) of the next round: the "adaptive" in AGPD.
+
+    A round is good if guided episodes succeed as often as the teacher's own, up to TOLERANCE; then the strength grows
+    by GROWTH, else it shrinks by the same factor. While the student is weak its pull costs success and the strength
+    stays small; as the student improves the strength rises. Where nothing succeeds nothing is known, and it stays.
+
+    Args:
+        strength: of the finished round.
+        guided_success: success rate of its guided episodes, None if there were none.
+        teacher_success: success rate of the teacher alone, None if unknown.
+        config: upper limit; a first strength beyond a limit only ever moves back toward it.
+        reachable: the largest strength that the teacher's sampler can follow.
+    """
+    if guided_success is None or teacher_success is None:
+        return strength
+    if not config.adaptive or config.first_strength == 0:
+        return strength
+    if guided_success == teacher_success == 0:
+        return strength
+    if guided_success >= teacher_success - TOLERANCE:
+        return max(strength, min(strength * GROWTH, config.max_strength, reachable))
+    return min(strength, max(strength / GROWTH, MIN_STRENGTH))
 
 
 def require_strength(
