@@ -17,7 +17,7 @@ from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.loading import check_fit, collection_environment, load_teacher, vectors
 from lerobot_agpd.progress import Progress, find_replay_root
 from lerobot_agpd.replay.backgrounds import require_masks
-from lerobot_agpd.replay.demonstrations import DemonstrationFrames
+from lerobot_agpd.replay.demonstrations import DemonstrationFrames, require_dataset
 from lerobot_agpd.replay.export import check_observation
 from lerobot_agpd.replay.frame_features import FrameFeatures
 from lerobot_agpd.replay.journal import EpisodeJournal
@@ -95,6 +95,7 @@ def build_parts(
         not run.sharded,
         "--parallelism.*: AGPD collects with whole policies, so it cannot shard them; use DDP",
     )
+    dataset_meta = require_dataset(dataset_meta)
     progress = Progress.restore(config, run)
     self_teacher = _self_teacher(student, progress)
     teacher = None if self_teacher else _teacher(config)
