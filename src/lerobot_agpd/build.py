@@ -22,7 +22,7 @@ from lerobot_agpd.progress import REPLAY_FOLDER, Progress, find_replay_root
 from lerobot_agpd.references import References, make_references
 from lerobot_agpd.replay.backgrounds import require_masks
 from lerobot_agpd.replay.chunk_store import FOLDER, ChunkStore
-from lerobot_agpd.replay.demonstrations import DemonstrationFrames
+from lerobot_agpd.replay.demonstrations import DemonstrationFrames, require_dataset
 from lerobot_agpd.replay.export import check_observation
 from lerobot_agpd.replay.frame_features import FrameFeatures
 from lerobot_agpd.replay.journal import EpisodeJournal
@@ -102,6 +102,7 @@ def build_parts(
         not run.sharded,
         "--parallelism.*: AGPD collects with whole policies, so it cannot shard them; use DDP",
     )
+    dataset_meta = require_dataset(dataset_meta)
     progress = Progress.restore(config, run)
     _require_intact(progress)
     self_teacher = _self_teacher(student, progress)

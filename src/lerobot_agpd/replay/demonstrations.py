@@ -36,6 +36,20 @@ def low_dimensional_keys(config: PreTrainedConfig) -> list[str]:
     return [ACTION, *inputs]
 
 
+def require_dataset(dataset_meta: LeRobotDatasetMetadata | None) -> LeRobotDatasetMetadata:
+    """Refuse to train a policy that was built without a dataset.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    if dataset_meta is None:
+        raise ValueError(
+            "the batch holds single frames, but the policy was built without dataset_meta and cannot cut chunks "
+            "from memory; pass chunks (B, steps, action_dim) or build the policy with make_policy"
+        )
+    return dataset_meta
+
+
 class DemonstrationFrames:
     """Demonstration frames in memory, normalized as the training loop normalizes them when they are gathered.
 
@@ -65,11 +79,7 @@ class DemonstrationFrames:
         dataset_stats: Statistics | None = None,
         also_held: Sequence[str] = (),
     ):
-        if dataset_meta is None:
-            raise ValueError(
-                "the batch holds single frames, but the policy was built without dataset_meta and cannot cut chunks "
-                "from memory; pass chunks (B, steps, action_dim) or build the policy with make_policy"
-            )
+        dataset_meta = require_dataset(dataset_meta)
         self.config = config
         self.keys = low_dimensional_keys(config)
         self.dataset = LeRobotDataset(
