@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import json
-import logging
 import math
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal, get_type_hints
+from typing import Literal
 
 import draccus
 from diffusers.optimization import SchedulerType
-from draccus.parsers.decoding import decode_dataclass
 from draccus.utils import ParsingError
 from huggingface_hub.constants import CONFIG_NAME
 from huggingface_hub.utils import HFValidationError, validate_repo_id
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig
-
-logger = logging.getLogger(__name__)
 
 EVALUATION_SEEDS = (100_000, 1_000_000)
 """Environment seeds left to final evaluations; LeRobot's own evaluation during training counts up from --seed."""
@@ -427,28 +422,3 @@ class StudentConfig(PreTrainedConfig):
         config.collect.env = None
         with open(save_directory / CONFIG_NAME, "w") as file:
             json.dump(draccus.encode(config, PreTrainedConfig), file, indent=4)
-
-
-@draccus.decode.register(StudentConfig, include_subclasses=True)
-def _decode_checkpoint(
-    cls: type[StudentConfig], raw: Mapping[str, Any], path: Sequence[str]
-) -> StudentConfig:
-    """Decode a checkpoint's config.json: settings of the groups that another version has are left out.
-
-    They concern training alone, and a checkpoint is read to be evaluated or trained anew. Flags, and the configuration of a
-    run, are decoded as a field of `TrainPipelineConfig`, where an unknown setting stays an error.
-    """
-    content, unknown = dict(raw), []
-    for entry in fields(StudentConfig):
-        group, known = content.get(entry.name), get_type_hints(StudentConfig)[entry.name]
-        if isinstance(group, Mapping) and is_dataclass(known):
-            names = {inner.name for inner in fields(known)}
-            unknown += [f"{entry.name}.{name}" for name in sorted(set(group) - names)]
-            content[entry.name] = {name: value for name, value in group.items() if name in names}
-    if unknown:
-        logger.warning(
-            "the checkpoint was written by another version of lerobot_policy_agpd: its settings %s are left out; they "
-            "concern training, not what the policy does",
-            unknown,
-        )
-    return decode_dataclass(cls, content, path)

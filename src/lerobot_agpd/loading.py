@@ -226,7 +226,8 @@ def check_fit(
             require(
                 env_config.fps == demonstrations.fps,
                 f"the demonstrations (--dataset.*) were recorded at {demonstrations.fps} frames per second, the "
-                f"environment '{env_config.type}' (--env.fps) runs at {env_config.fps}: T would mix two time scales",
+                f"environment '{env_config.type}' (--env.fps) runs at {env_config.fps}: T would mix two time scales. Take "
+                "demonstrations of the environment's rate; where --env.fps is only declared, give the rate at which it steps",
             )
     if teacher is None:
         return

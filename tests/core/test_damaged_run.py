@@ -29,7 +29,7 @@ DAMAGE = {
     "truncated weights": (CHECKPOINT + "model.safetensors", truncate, "checkpoint"),
     "truncated counters": (CHECKPOINT + "agpd_state.json", truncate, "earlier checkpoint"),
     "missing counters": (CHECKPOINT + "agpd_state.json", Path.unlink, "--policy.path"),
-    "truncated processors": (CHECKPOINT + "policy_preprocessor.json", truncate, "restore the file"),
+    "truncated processors": (CHECKPOINT + "policy_preprocessor.json", truncate, "restore it"),
 }
 
 
