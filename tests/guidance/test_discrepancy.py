@@ -107,14 +107,17 @@ def test_representation_predicts_a_change_and_sees_every_step():
     model = StateRepresentation(D, A, N)
     observation, actions = torch.randn(B, D), torch.randn(B, N, A, requires_grad=True)
     predicted = model(observation, actions)
-    torch.testing.assert_close(predicted - observation, model.decoder(model.encode(observation, actions)))
+    change = model.decoder(model.encode(observation, actions))
+    torch.testing.assert_close(predicted - observation, change.flatten(1))
     predicted.sum().backward()
     assert (actions.grad.abs().sum(dim=2) > 0).all()
 
 
-def test_the_latent_is_the_encoders_first_token():
-    model = StateRepresentation(D, A, N)
-    observation, actions = torch.randn(B, D), torch.randn(B, N, A)
-    tokens = torch.cat([model.observation_token(observation)[:, None], model.action_token(actions)], dim=1)
-    whole = model.encoder(tokens + model.position)
-    torch.testing.assert_close(model.encode(observation, actions), model.to_latent(whole[:, 0]))
+@pytest.mark.parametrize("n_tokens", [1, 2])
+def test_the_latents_are_the_encoders_first_tokens(n_tokens):
+    model = StateRepresentation(2 * D, A, N, n_tokens)
+    observation, actions = torch.randn(B, 2 * D), torch.randn(B, N, A)
+    observed = model.observation_token(observation.reshape(B, n_tokens, -1))
+    whole = model.encoder(torch.cat([observed, model.action_token(actions)], dim=1) + model.position)
+    latents = model.to_latent(whole[:, :n_tokens])
+    torch.testing.assert_close(model.encode(observation, actions), latents)

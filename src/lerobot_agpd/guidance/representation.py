@@ -59,6 +59,7 @@ class StateRepresentation(nn.Module):
         *layers, last = self.encoder.layers
         for layer in layers:
             tokens = layer(tokens)
+        assert isinstance(last, nn.TransformerEncoderLayer)
         return self.to_latent(_first_tokens(last, tokens, self.n_tokens))
 
     def forward(self, observation: Tensor, actions: Tensor) -> Tensor:
@@ -66,8 +67,8 @@ class StateRepresentation(nn.Module):
         return observation + self.decoder(self.encode(observation, actions)).flatten(1)
 
 
-def _first_tokens(layer: nn.Module, tokens: Tensor, n_tokens: int) -> Tensor:
-    """The first output tokens (B, N, W) of a nn.TransformerEncoderLayer with norm_first; the others are not computed."""
+def _first_tokens(layer: nn.TransformerEncoderLayer, tokens: Tensor, n_tokens: int) -> Tensor:
+    """The first output tokens (B, N, W) of a layer with norm_first; the others are not computed."""
     normed = layer.norm1(tokens)
     first = (
         tokens[:, :n_tokens] + layer.self_attn(normed[:, :n_tokens], normed, normed, need_weights=False)[0]

@@ -43,7 +43,9 @@ class ServedFrames:
     def __call__(self, indices: Sequence[int]) -> list[Item]:
         """The items at relative indices, in the order of LeRobot's own keys."""
         rows = torch.as_tensor(indices)
-        columns = {key: column[rows].unbind() for key, column in self.columns.items()}
+        columns: dict[str, Sequence[Tensor | str]] = {
+            key: column[rows].unbind() for key, column in self.columns.items()
+        }
         columns |= {key: [str(texts[index]) for index in indices] for key, texts in self.texts.items()}
         columns["task"] = [self.tasks[index] for index in self.columns["task_index"][rows].tolist()]
         return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
@@ -56,7 +58,7 @@ def serve_from_memory(dataset: LeRobotDataset) -> None:
     """
     if dataset.meta.camera_keys or dataset.delta_timestamps or hasattr(dataset, "__getitems__"):
         return
-    if all(
-        isinstance(value, Tensor | str) for value in dataset[0].values()
-    ):  # no annotations in natural language
+    first = dataset[0]
+    assert isinstance(first, dict)  # for one index
+    if all(isinstance(value, Tensor | str) for value in first.values()):  # no annotations in natural language
         dataset.__getitems__ = ServedFrames(dataset)  # type: ignore[attr-defined]
