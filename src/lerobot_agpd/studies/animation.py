@@ -20,8 +20,8 @@ FONT = "DejaVuSans.ttf"  # matplotlib's, which is always there
 BACKGROUND, TEXT = (255, 255, 255), (40, 40, 40)
 SUCCESS, FAILURE = (0, 158, 115), (213, 94, 0)
 BORDER = 4  # pixels
-COLORS = 128
-"""Of a GIF's palette: simulators are plain, and colors cost bytes."""
+LARGE_COLORS, SMALL_COLORS = 80, 48
+"""Of a GIF's palette, for large surfaces and for small things: simulators are plain, and colors cost bytes."""
 
 PAUSE = 0.8
 """Seconds that a finished episode stays."""
@@ -95,15 +95,30 @@ def write_animation(rows: Mapping[str, Sequence[Clip]], path: Path, style: Style
     if path.suffix == ".mp4":
         write_video(path, [np.asarray(frame) for frame in frames], fps=round(style.fps))
         return
-    # One palette for all frames, taken from all over the film: GIF then stores what changes alone.
-    shown = [np.asarray(frame) for frame in frames[:: len(frames) // 8 + 1]]
-    # What is small and bright, such as a cube or a border, must get a color too; median cut would give it none.
-    swatches = [np.full_like(shown[0][:8], color) for color in (SUCCESS, FAILURE)]
-    palette = Image.fromarray(np.concatenate(shown + swatches)).quantize(COLORS, Image.Quantize.MAXCOVERAGE)
+    palette = _palette(frames)
     first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     first.save(
         path, save_all=True, append_images=others, duration=round(1000 / style.fps), loop=0, optimize=True
     )
+
+
+def _palette(frames: Sequence[Image.Image]) -> Image.Image:
+    """One palette for all frames, from all over the film: a GIF then stores what changes alone.
+
+    Median cut spends its colors on what is large; a few more cover what is small and bright, such as a cube or a border.
+    """
+    shown = [np.asarray(frame) for frame in frames[:: len(frames) // 8 + 1]]
+    borders = [np.full_like(shown[0][:8], color) for color in (SUCCESS, FAILURE)]
+    sample = Image.fromarray(np.concatenate(shown + borders))
+    colors: list[int] = []
+    for n_colors, method in (
+        (LARGE_COLORS, Image.Quantize.MEDIANCUT),
+        (SMALL_COLORS, Image.Quantize.MAXCOVERAGE),
+    ):
+        colors += (sample.quantize(n_colors, method).getpalette() or [])[: 3 * n_colors]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(colors)
+    return palette
 
 
 def _frames(rows: Mapping[str, Sequence[Clip]], style: Style) -> Iterator[Image.Image]:

@@ -68,6 +68,8 @@ def _draw_curves(axes: Axes, methods: Runs, measure: str, intervals: bool) -> No
         if intervals:
             axes.axhspan(level.low, level.high, color=color, alpha=0.1, linewidth=0)
     axes.set(xlabel="gradient steps", ylabel=LABELS[measure])
+    if not trained:  # levels alone, which have no steps
+        axes.set(xlabel="", xticks=[])
     if measure == "success":
         axes.set_ylim(-0.02, 1.02)
     axes.grid(alpha=0.3)
