@@ -297,7 +297,9 @@ def _check_environment(student: StudentConfig, teacher: Teacher | None, env_conf
             f"the {observer} observes {sorted(inputs)}, the environment '{env_config.type}' delivers "
             f"{sorted(set(delivered) - {ACTION})}: {missing} is missing (check --env.obs_type and --dataset.*)",
         )
-    sources = {"the demonstrations (--dataset.*)": {**observers["student"], ACTION: _action(student)}}
+    sources: dict[str, Features] = {
+        "the demonstrations (--dataset.*)": {**observers["student"], ACTION: _action(student)}
+    }
     if teacher is not None:
         sources["the teacher (--policy.teacher.path)"] = teacher.input_features
     for source, features in sources.items():
@@ -307,7 +309,7 @@ def _check_environment(student: StudentConfig, teacher: Teacher | None, env_conf
             require(
                 needed == given,
                 f"'{key}' has shape {needed} in {source} and {given} in the environment '{env_config.type}' (--env.*, "
-                f"task {env_config.task})",
+                f"task {env_config.task}), which shows {_shapes(delivered)}",
             )
 
 

@@ -133,5 +133,5 @@ class DinoEncoder(VisualEncoder):
 
 def pooled(maps: Tensor) -> Tensor:
     """Tokens (B, N, F) of feature maps (B, F, h, w), which are averaged to at most MAP_SIZE x MAP_SIZE."""
-    size = [min(side, MAP_SIZE) for side in maps.shape[-2:]]
-    return F.adaptive_avg_pool2d(maps, size).flatten(2).transpose(1, 2)
+    height, width = (min(side, MAP_SIZE) for side in maps.shape[-2:])
+    return F.adaptive_avg_pool2d(maps, (height, width)).flatten(2).transpose(1, 2)

@@ -17,7 +17,7 @@ def first_observation(env_config: EnvConfig, policy_config: PreTrainedConfig) ->
     try:
         envs = next(envs for suite in tasks.values() for envs in suite.values())
         preprocess, _ = make_env_pre_post_processors(env_config, policy_config)
-        observation, _ = envs.reset(seed=[COLLECTION_SEEDS[0]])
+        observation, _ = envs.reset(seed=COLLECTION_SEEDS[0])
         processed = preprocess(preprocess_observation(observation))
         return {key: as_recorded(value[0]) for key, value in processed.items() if isinstance(value, Tensor)}
     finally:
