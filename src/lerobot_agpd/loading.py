@@ -312,7 +312,7 @@ def _check_environment(student: StudentConfig, teacher: Teacher | None, env_conf
             require(
                 needed == given,
                 f"'{key}' has shape {needed} in {source} and {given} in the environment '{env_config.type}' (--env.*, "
-                f"task {env_config.task})",
+                f"task {env_config.task}), which shows {_shapes(delivered)}",
             )
 
 
