@@ -15,7 +15,8 @@ from rich.console import Console
 
 from lerobot_agpd.cli.compare import CompareConfig, load
 from lerobot_agpd.config import FlagError
-from lerobot_agpd.studies.jobs import Job, cluster_executor, run_jobs
+from lerobot_agpd.studies.cluster import cluster_executor
+from lerobot_agpd.studies.jobs import Job, run_jobs
 
 pytest.importorskip("lerobot_policy_agpd")  # registers the environment types
 
@@ -29,9 +30,11 @@ def python(code: str) -> list[str]:
 def job(tmp_path: Path, name: str, *codes: str) -> Job:
     """Runs Python programs one after the other."""
 
+    commands, log = [python(code) for code in codes], tmp_path / f"{name}.log"
+
     def work(execute) -> None:
-        for code in codes:
-            execute(python(code), tmp_path / f"{name}.log")
+        for command in commands:
+            execute(command, log)
 
     return Job(name, tmp_path / name, work)
 

@@ -1,7 +1,7 @@
 """As many environments as can be busy, kept from round to round."""
 
 from hypothesis import given, strategies as st
-from point_environment import PointEnv
+from point_environment import LIMIT, PointEnv
 
 from lerobot_agpd.rollout.kept_environments import KeptEnvironments, slots
 
@@ -25,3 +25,11 @@ def test_environments_are_built_anew_for_another_number_only():
     kept.close()
     assert other.closed and kept.of_size(3) != [other]
     kept.close()
+
+
+def test_they_know_their_step_limit():
+    """Before and after they are built."""
+    unbuilt, built = (KeptEnvironments(PointEnv(), use_async=False) for _ in range(2))
+    built.of_size(2)
+    assert unbuilt.step_limit == built.step_limit == LIMIT
+    built.close()

@@ -94,13 +94,3 @@ def test_an_environment_that_never_ends(stuck_run, caplog, use_async_envs):
     lengths = {record.number: record.length for record in run.records(0)}
     assert lengths[0] == 2 * LIMIT and max(length for number, length in lengths.items() if number) <= LIMIT
     assert not run.records(0)[0].invalid and "is cut off after 24 steps" in caplog.text
-
-
-def test_an_environment_has_one_step_more_than_its_own_limit(start):
-    run = start()
-    assert (
-        run.agpd.collector._max_steps(
-            [gym.vector.SyncVectorEnv([lambda: gym.make("lerobot_agpd_tests/Point-v0")])]
-        )
-        == LIMIT + 1
-    )

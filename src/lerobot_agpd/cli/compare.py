@@ -12,8 +12,9 @@ from rich.markdown import Markdown
 
 from lerobot_agpd.cli.command import entry_point
 from lerobot_agpd.config import require
+from lerobot_agpd.studies.cluster import cluster_executor
 from lerobot_agpd.studies.comparison import REPORT, Comparison, write_report
-from lerobot_agpd.studies.jobs import Executor, cluster_executor, run_jobs
+from lerobot_agpd.studies.jobs import Executor, run_jobs
 from lerobot_agpd.studies.matrix import load_matrix
 from lerobot_agpd.studies.run_results import evaluate_run
 from lerobot_agpd.studies.runs import Run, check, expand

@@ -8,7 +8,7 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,8 +23,6 @@ from rich.progress import (
     TextColumn,
     TimeElapsedColumn,
 )
-
-from lerobot_agpd.config import FlagError
 
 logger = logging.getLogger(__name__)
 
@@ -70,31 +68,6 @@ class Executor(Protocol):
 
     def submit(self, function: Callable[[Job], None], job: Job, /) -> Submitted:
         """Have the function called with the job, perhaps on another machine."""
-
-
-def cluster_executor(cluster: str, folder: Path, options: Mapping[str, int | str]) -> Executor:
-    """Submitit's executor for a cluster; `local` makes processes on this machine.
-
-    Args:
-        cluster: as submitit names it, such as slurm.
-        folder: where it keeps its files; one that all machines see.
-        options: what submitit's `update_parameters` takes, such as timeout_min.
-
-    Raises:
-        FlagError: if submitit is not installed or does not know an option.
-    """
-    try:
-        import submitit
-    except ImportError as error:
-        raise FlagError(
-            f"--executor={cluster} needs submitit: pip install 'lerobot_policy_agpd[cluster]'"
-        ) from error
-    executor = submitit.AutoExecutor(folder, cluster=cluster)
-    try:
-        executor.update_parameters(**options)
-    except (NameError, TypeError, ValueError) as error:
-        raise FlagError(f"--executor_options={dict(options)}: {error}") from error
-    return executor
 
 
 @dataclass
