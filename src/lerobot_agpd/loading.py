@@ -255,7 +255,9 @@ def check_teacher(
     Raises:
         FlagError: naming both sides and what differs.
     """
-    sources: dict[str, Features] = {"the demonstrations (--dataset.*)": dataset_to_policy_features(demonstrations.features)}
+    sources: dict[str, Features] = {
+        "the demonstrations (--dataset.*)": dataset_to_policy_features(demonstrations.features)
+    }
     if env_config is not None:
         sources[f"the environment '{env_config.type}' (--env.*)"] = env_to_policy_features(env_config)
     needed = tuple(teacher.action_feature.shape)
@@ -298,7 +300,9 @@ def _check_environment(student: StudentConfig, teacher: Teacher | None, env_conf
             f"the {observer} observes {sorted(inputs)}, the environment '{env_config.type}' delivers "
             f"{sorted(set(delivered) - {ACTION})}: {missing} is missing (check --env.obs_type and --dataset.*)",
         )
-    sources: dict[str, Features] = {"the demonstrations (--dataset.*)": {**observers["student"], ACTION: _action(student)}}
+    sources: dict[str, Features] = {
+        "the demonstrations (--dataset.*)": {**observers["student"], ACTION: _action(student)}
+    }
     if teacher is not None:
         sources["the teacher (--policy.teacher.path)"] = teacher.input_features
     for source, features in sources.items():
