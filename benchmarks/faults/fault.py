@@ -25,6 +25,9 @@ EXCEPTION = re.compile(r"^[\w.]*(Error|Exception|Interrupt|Exit): ")
 NOISE = re.compile(r"^.*(WARNING|ERROR)( \d{4}-\d\d-\d\d [\d:]+ \S+:\d+ |:lerobot_agpd[\w.]*:)")
 """What LeRobot's logging, and a progress bar on the same line, put before a message."""
 
+CURSOR = re.compile(r"\x1b\[[A-Z]")
+"""Moves of the cursor."""
+
 PROGRESS = re.compile(r"\d+/\d+ \[")
 """Lines of progress bars."""
 
@@ -131,7 +134,7 @@ def run_fault(fault: Fault, bench: Bench) -> Result:
     log = (bench.folder / "log" / "rank-0.log").read_text(errors="replace")
     places = {"output": bench.output, "demos": bench.demos, "teacher": bench.teacher}
     names = [name.format(**places) for name in fault.names]
-    lines = [NOISE.sub("", line).strip() for line in log.splitlines()]
+    lines = [NOISE.sub("", line).strip() for line in CURSOR.sub("", log).splitlines()]
     lines = [line for line in lines if line and not PROGRESS.search(line)]
     said = [line for line in lines if all(name in line for name in names)]
     last = lines[-1] if lines else ""

@@ -206,7 +206,7 @@ ENVIRONMENTS = [
         environment("nan_state", ALL),
         "stopped",
         ("4 of 4 episodes are dropped", "'observation.state'", "--env.*", "--resume=true"),
-        "all episodes are kept, everything is NaN, exit 0",
+        "",
     ),
     Fault(
         "an environment in a worker process hangs",
@@ -227,7 +227,7 @@ ENVIRONMENTS = [
         environment("dies", [2], WORKERS),
         "dropped",
         ("worker process has ended", "dropped"),
-        "the run ends with a BrokenPipeError",
+        "",
     ),
     Fault(
         "an episode never ends",
@@ -347,7 +347,7 @@ RUNS = [
         lambda bench: bench.begin(f"--policy.replay.root={bench.folder / 'disk' / 'agpd'}"),
         "stopped",
         ("No space left", "disk/agpd"),
-        "an OSError that names no file",
+        "an error that names no file",
         inside=full_disk,
         afterwards=_kept_on_full_disk,
     ),
@@ -395,7 +395,7 @@ RUNS = [
         without_last,
         "named",
         ("does not exist", "goes on with: lerobot-train", "000006"),
-        "HFValidationError",
+        "refused; neither command goes on",
     ),
 ]
 

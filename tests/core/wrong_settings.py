@@ -15,7 +15,8 @@ WRONG = {
     int: ("some", "1.5", "nan"),
     bool: ("perhaps",),
 }
-GROUPS = set(get_type_hints(StudentConfig)) - set(get_type_hints(PreTrainedConfig))
+HINTS = get_type_hints(StudentConfig)
+GROUPS = {name for name in set(HINTS) - set(get_type_hints(PreTrainedConfig)) if is_dataclass(HINTS[name])}
 
 OUT_OF_RANGE: dict[str, tuple[float | str, ...]] = {
     "teacher.num_inference_steps": (0, -3),
@@ -72,8 +73,7 @@ def of_wrong_type(group: type, prefix: str) -> Iterator[str]:
 
 def of_wrong_types() -> list[tuple[str, str]]:
     """Type of policy, and a setting that is no number or choice: a student's groups, counts of diffusion policies."""
-    hints = get_type_hints(StudentConfig)
-    groups = [setting for name in sorted(GROUPS) for setting in of_wrong_type(hints[name], f"{name}.")]
+    groups = [setting for name in sorted(GROUPS) for setting in of_wrong_type(HINTS[name], f"{name}.")]
     counts = [f"{flag}={value}" for flag in COUNTS for value in ("some", "1.5")]
     return [
         *(("agpd", setting) for setting in groups),
