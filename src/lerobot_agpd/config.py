@@ -343,8 +343,7 @@ class StudentConfig(PreTrainedConfig):
     collect: CollectConfig = field(default_factory=CollectConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     adversary: AdversaryConfig = field(default_factory=AdversaryConfig)
-    # Features of the demonstrations that the student sees, e.g. "[observation.state,observation.image]"; default: all.
-    # The teacher sees what it was trained on, whatever the student sees.
+    # Declared again, with its help, by the concrete classes: the flag parser reads comments of the class itself alone.
     inputs: list[str] | None = None
 
     def select_inputs(self) -> None:

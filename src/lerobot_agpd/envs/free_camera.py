@@ -13,7 +13,7 @@ from lerobot_agpd.envs.poses import CameraPose
 class FreeCameraEnvConfig(SimulatedEnvConfig):
     """Adds the pose of the main camera, and named cameras in the place of its image."""
 
-    # Cameras to observe in the place of the main one, e.g. "[front,side]" (Fetch only).
+    # Cameras to observe in the place of the main one, e.g. '["front","side"]' (Fetch only).
     cameras: list[str] | None = None
     # Distance of the main camera from what it looks at, meters; default: the task's.
     camera_distance: float | None = None

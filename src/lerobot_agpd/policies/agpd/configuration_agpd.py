@@ -28,6 +28,9 @@ class AGPDConfig(ACTConfig, StudentConfig):
             "ACTION": NormalizationMode.MEAN_STD,
         }
     )
+    # Features of the demonstrations that the student sees, e.g. '["observation.state","observation.image"]'; default: all.
+    # The teacher sees what it was trained on, whatever the student sees.
+    inputs: list[str] | None = None
     # Image encoder. resnet: LeRobot's vision_backbone, whose batch norm is the pretrained weights' and frozen;
     # resnet_group_norm: the same without pretrained weights; small: four convolutions, for a CPU. The last two learn from
     # scratch, so they take optimizer_lr in the place of optimizer_lr_backbone.

@@ -20,6 +20,10 @@ class AGPDDiffusionConfig(DiffusionTransformerConfig, StudentConfig):
     With `teacher.path` it learns from that teacher; without, from itself (self-distillation).
     """
 
+    # Features of the demonstrations that the student sees, e.g. '["observation.state","observation.image"]'; default: all.
+    # The teacher sees what it was trained on, whatever the student sees.
+    inputs: list[str] | None = None
+
     def _check_memory(self) -> None:
         """Images are allowed: T reads those from disk."""
 
