@@ -49,7 +49,7 @@ QUICK = {
         "--env.visualization_width=64",
         "--env.visualization_height=64",
     ],
-    "lerobot-agpd-probe": ["--states=4", "--samples=8"],
+    "lerobot-agpd-probe": ["--states=4", "--samples=24"],
     "lerobot-eval": [*SHORT, "--eval.n_episodes=2", "--eval.batch_size=2", "--eval.use_async_envs=false"],
 }
 """Command to what makes it quick."""

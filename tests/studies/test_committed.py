@@ -56,7 +56,7 @@ def test_rounds_have_todays_keys(task):
 def test_reports_and_sweeps_are_read():
     results = committed.read_report(BENCHMARKS / "quickstart/report.json")
     (agpd,) = (result for result in results if result.rounds)
-    assert len(agpd.finals["last"].seeds) == len(agpd.finals["last"].successes) > 100
+    assert len(agpd.finals["last"].seeds) == len(agpd.finals["last"].successes) >= 100
     assert len(rounds_table(agpd.rounds)) == 1 + len(agpd.rounds) == 6
     assert 0 < success_rate([round_.strategy for round_ in agpd.rounds]) <= 1
     rows = committed.read_sweep(BENCHMARKS / "diversity/fetchpush/sweep.json")
