@@ -334,7 +334,8 @@ class AdversaryConfig:
 class StudentConfig(PreTrainedConfig):
     """Configuration of a student: the groups of the method beside those of a LeRobot policy.
 
-    A concrete class names it behind the policy's own configuration, whose defaults then count.
+    A concrete class names it behind the policy's own configuration, whose defaults then count. It declares `inputs` again:
+    the flag parser reads the comments of a class itself alone.
     """
 
     teacher: TeacherConfig = field(default_factory=TeacherConfig)
@@ -343,7 +344,8 @@ class StudentConfig(PreTrainedConfig):
     collect: CollectConfig = field(default_factory=CollectConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     adversary: AdversaryConfig = field(default_factory=AdversaryConfig)
-    # Declared again, with its help, by the concrete classes: the flag parser reads comments of the class itself alone.
+    # Features of the demonstrations that the student sees, e.g. '["observation.state","observation.image"]'; default: all.
+    # The teacher sees what it was trained on, whatever the student sees.
     inputs: list[str] | None = None
 
     def select_inputs(self) -> None:

@@ -76,7 +76,7 @@ def start(agpd_config, camera_demonstrations, tmp_path, monkeypatch):
 
 
 def test_a_teacher_that_sees_the_state_teaches_a_student_that_sees_images(start, camera_demonstrations):
-    run = start().train(until=8)
+    run = start(replay=ReplayConfig(relabel="all")).train(until=8)
     assert list(run.policy.config.input_features) == [STATE, IMAGE]
     replay, n_demonstrated = run.agpd.replay, len(camera_demonstrations)
     assert replay.n_collected_frames > 0 and {log["discriminator_loss"] for log in run.logs[3:]} != {0.0}

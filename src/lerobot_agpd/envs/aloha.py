@@ -45,7 +45,7 @@ class AlohaStateEnvConfig(SimulatedEnvConfig):
     task: str | None = "AlohaTransferCube-v0"
     # What is observed: environment_state_agent_pos, pixels_agent_pos, pixels or pixels_environment_state_agent_pos.
     obs_type: str = "environment_state_agent_pos"
-    # Cameras to observe, e.g. "[top,angle]".
+    # Cameras to observe, e.g. '["top","angle"]'.
     cameras: list[str] = field(default_factory=lambda: ["top"])
     # Height of observed images, pixels.
     observation_height: int = 240

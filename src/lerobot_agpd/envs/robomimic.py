@@ -23,7 +23,7 @@ class RobomimicEnvConfig(SimulatedEnvConfig):
 
     # Task of robomimic: lift, can, square, transport or tool_hang.
     task: str | None = "lift"
-    # Cameras to observe, e.g. "[agentview]"; default: those of robomimic's image datasets.
+    # Cameras to observe, e.g. '["agentview"]'; default: those of robomimic's image datasets.
     cameras: list[str] | None = None
     # Height of observed images, pixels; robomimic has 240 for tool_hang.
     observation_height: int = 84

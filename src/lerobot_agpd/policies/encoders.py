@@ -34,9 +34,6 @@ class SmallEncoder(nn.Module):
     The whole image becomes one token, so it costs ACT's transformer as much as a state. In training every image is
     shifted by up to `shift` pixels (DrQ, arXiv:2004.13649).
 
-    The linear layer sees where everything is at once. A spatial softmax in its place (arXiv:1504.00702) had found Fetch's
-    block after as many training steps, and not yet its goal, a dot of four pixels (docs/vision.md).
-
     Args:
         shift: largest shift, pixels; 0: none.
     """
