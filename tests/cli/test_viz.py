@@ -30,6 +30,7 @@ N_STEPS, EPISODE_LENGTH = 4, 10
 def call(monkeypatch, *options: str) -> None:
     arguments = ["--env.type=pusht", "--env.obs_type=environment_state_agent_pos"]
     arguments += [f"--env.episode_length={EPISODE_LENGTH}", "--env.visualization_width=96"]
+    arguments += ["--env.visualization_height=96"]
     monkeypatch.setattr(sys, "argv", ["lerobot-agpd-viz", *arguments, *options])
     viz.main()
 

@@ -9,7 +9,7 @@ import draccus
 import numpy as np
 import pytest
 import torch
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -132,7 +132,14 @@ def test_defaults_build_without_teacher_or_dataset(policy_type, input_features, 
 @pytest.mark.parametrize("preset", PRESETS, ids=lambda path: path.stem)
 def test_presets_describe_a_policy(preset, input_features, output_features):
     run = draccus.parse(TrainPipelineConfig, config_path=preset, args=["--dataset.repo_id=local/small"])
-    run.policy.input_features, run.policy.output_features = dict(input_features), dict(output_features)
+    image = PolicyFeature(FeatureType.VISUAL, (3, 96, 96))
+    images = {key: image for key in getattr(run.policy, "inputs", None) or [] if key not in input_features}
+    run.policy.input_features, run.policy.output_features = (
+        {**input_features, **images},
+        dict(output_features),
+    )
+    if images:
+        run.policy.pretrained_backbone_weights = None  # they would be downloaded
     get_policy_class(run.policy.type)(run.policy)
 
 
