@@ -46,6 +46,19 @@ def interruptions_page(folder: Path) -> str:
     ) + "\n"
 
 
+def _long_run(path: Path) -> dict[str, str]:
+    """Some samples of the long run, and how long it was."""
+    content = json.loads(path.read_text())
+    samples = content["samples"]
+    rows = [("minutes", "rounds", "resident memory, MiB", "file handles", "threads")]
+    for seconds, rss, handles, threads, rounds in [*samples[4 :: len(samples) // 7], samples[-1]]:
+        rows.append(
+            (f"{seconds / 60:.1f}", f"{rounds:.0f}", f"{rss:.0f}", f"{handles:.0f}", f"{threads:.0f}")
+        )
+    minutes, rounds = samples[-1][0] / 60, samples[-1][-1]
+    return {"long_table": markdown(rows), "minutes": f"{minutes:.0f}", "rounds": f"{rounds:.0f}"}
+
+
 def faults_page(folder: Path) -> str:
     """Every fault with what happened before and what happens now."""
     content = json.loads((folder / "faults.json").read_text())
