@@ -99,7 +99,9 @@ def speed_page(path: Path) -> str:
         name: markdown(speed_table(section["rows"], before.get(name, {}).get("rows", {})))
         for name, section in content["sections"].items()
     }
-    return text(path.parent).format(machine=machine, **tables) + "\n"
+    page = text(path.parent)
+    tables |= {name: "*Not measured.*" for name in re.findall(r"\{(\w+)\}", page) if name not in tables}
+    return page.format(**{**tables, "machine": machine}) + "\n"
 
 
 def speed_table(rows: dict[str, dict[str, float]], before: dict[str, dict[str, float]]) -> list[tuple]:
@@ -109,7 +111,9 @@ def speed_table(rows: dict[str, dict[str, float]], before: dict[str, dict[str, f
     used = [key for key in used if key != "wall_ms" or "cpu_ms" not in used]
     table = [("", *(columns[key] for key in used), "ratio", "before")]
     for name, row in rows.items():
-        cells = [f"{row[key]:.3g}" if key in row and row[key] < 1000 else _whole(row.get(key)) for key in used]
+        cells = [
+            f"{row[key]:.3g}" if key in row and row[key] < 1000 else _whole(row.get(key)) for key in used
+        ]
         ratios = [entry.get("ratio") for entry in (row, before.get(name, {}))]
         table.append((name, *cells, *("-" if ratio is None else f"{ratio:.2f}" for ratio in ratios)))
     return table

@@ -55,6 +55,7 @@ class StateRepresentation(nn.Module):
         *layers, last = self.encoder.layers
         for layer in layers:
             tokens = layer(tokens)
+        assert isinstance(last, nn.TransformerEncoderLayer)
         return self.to_latent(_first_token(last, tokens))
 
     def forward(self, observation: Tensor, actions: Tensor) -> Tensor:
@@ -62,7 +63,7 @@ class StateRepresentation(nn.Module):
         return observation + self.decoder(self.encode(observation, actions))
 
 
-def _first_token(layer: nn.Module, tokens: Tensor) -> Tensor:
+def _first_token(layer: nn.TransformerEncoderLayer, tokens: Tensor) -> Tensor:
     """The first output token (B, W) of a nn.TransformerEncoderLayer with norm_first, without computing the others."""
     normed = layer.norm1(tokens)
     first = tokens[:, 0] + layer.self_attn(normed[:, :1], normed, normed, need_weights=False)[0][:, 0]
