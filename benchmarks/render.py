@@ -88,7 +88,9 @@ def speed_page(path: Path) -> str:
         name: markdown(speed_table(section["rows"], before.get(name, {}).get("rows", {})))
         for name, section in content["sections"].items()
     }
-    return text(path.parent).format(machine=machine, **tables) + "\n"
+    page = text(path.parent)
+    tables |= {name: "*Not measured.*" for name in re.findall(r"\{(\w+)\}", page) if name not in tables}
+    return page.format(**{**tables, "machine": machine}) + "\n"
 
 
 def speed_table(rows: dict[str, dict[str, float]], before: dict[str, dict[str, float]]) -> list[tuple]:
