@@ -79,6 +79,6 @@ class ReferencePool:
         """New frames, uniform over those of T that begin a chunk."""
         taken = torch.tensor([frame for batch in self.batches for frame in batch], dtype=torch.long)
         frames = self.replay.starts()
-        frames = frames[~torch.isin(frames, taken)].numpy()
+        left = frames[~torch.isin(frames, taken)].numpy()
         rng = np.random.default_rng([self.seed, len(self.batches)])
-        return sorted(rng.choice(frames, min(n_frames, len(frames)), replace=False).tolist())
+        return sorted(rng.choice(left, min(n_frames, len(left)), replace=False).tolist())
