@@ -97,7 +97,11 @@ def speed_table(rows: dict[str, dict[str, float]], before: dict[str, dict[str, f
     """One row per action; a dash where something was not measured."""
     columns = {"cpu_ms": "CPU, ms", "wall_ms": "wall, ms", "frames_per_s": "kept frames/s", "bytes": "bytes"}
     used = [key for key in columns if any(key in row for row in rows.values())]
-    used = [key for key in used if key != "wall_ms" or "cpu_ms" not in used]
+    rows = {  # wall time alone where CPU time was not measured
+        name: {key: value for key, value in row.items() if key != "wall_ms" or "cpu_ms" not in row}
+        for name, row in rows.items()
+    }
+    used = [key for key in used if any(key in row for row in rows.values())]
     table = [("", *(columns[key] for key in used), "ratio", "before")]
     for name, row in rows.items():
         cells = [

@@ -74,12 +74,12 @@ class EpisodeTable:
             self._write_file()
         self.meta.finalize()
 
-    def _columns(self, rows: list[Frame], tasks: list[str]) -> dict[str, Array]:
+    def _columns(self, rows: list[Frame], tasks: list[str]) -> dict[str, Any]:
         """The values (T, ...) of an episode, LeRobot's own columns among them; features of one number are (T,)."""
         length, meta = len(rows), self.meta
         meta.save_episode_tasks(list(dict.fromkeys(tasks)))
         steps = np.arange(length)
-        columns: dict[str, Array] = {
+        columns: dict[str, Any] = {
             "timestamp": steps / meta.fps,
             "frame_index": steps,
             "episode_index": np.full(length, meta.total_episodes),

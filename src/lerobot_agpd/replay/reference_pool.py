@@ -78,7 +78,7 @@ class ReferencePool:
     def _choose(self, n_frames: int) -> list[int]:
         """New frames, uniform over those of T that begin a chunk."""
         taken = torch.tensor([frame for batch in self.batches for frame in batch], dtype=torch.long)
-        starts = self.replay.starts()
-        frames = starts[~torch.isin(starts, taken)].numpy()
+        frames = self.replay.starts()
+        left = frames[~torch.isin(frames, taken)].numpy()
         rng = np.random.default_rng([self.seed, len(self.batches)])
-        return sorted(rng.choice(frames, min(n_frames, len(frames)), replace=False).tolist())
+        return sorted(rng.choice(left, min(n_frames, len(left)), replace=False).tolist())

@@ -25,9 +25,7 @@ class ServedFrames:
     """
 
     def __init__(self, dataset: LeRobotDataset):
-        first = dataset[0]
-        assert isinstance(first, dict)  # for one index
-        frames = dataset.hf_dataset.with_format("numpy")[:]
+        first, frames = _first(dataset), dataset.hf_dataset.with_format("numpy")[:]
         self.columns = {
             key: torch.as_tensor(frames[key]).to(value.dtype).reshape(-1, *value.shape)
             for key, value in first.items()
@@ -43,12 +41,19 @@ class ServedFrames:
     def __call__(self, indices: Sequence[int]) -> list[Item]:
         """The items at relative indices, in the order of LeRobot's own keys."""
         rows = torch.as_tensor(indices)
-        columns: dict[str, Sequence[Tensor | str]] = {
+        columns: dict[str, Sequence[Any]] = {
             key: column[rows].unbind() for key, column in self.columns.items()
         }
         columns |= {key: [str(texts[index]) for index in indices] for key, texts in self.texts.items()}
         columns["task"] = [self.tasks[index] for index in self.columns["task_index"][rows].tolist()]
         return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+
+
+def _first(dataset: LeRobotDataset) -> Item:
+    """The first item."""
+    item = dataset[0]
+    assert isinstance(item, dict)  # a slice delivers a list
+    return item
 
 
 def serve_from_memory(dataset: LeRobotDataset) -> None:
@@ -58,7 +63,7 @@ def serve_from_memory(dataset: LeRobotDataset) -> None:
     """
     if dataset.meta.camera_keys or dataset.delta_timestamps or hasattr(dataset, "__getitems__"):
         return
-    first = dataset[0]
-    assert isinstance(first, dict)  # for one index
-    if all(isinstance(value, Tensor | str) for value in first.values()):  # no annotations in natural language
+    if all(
+        isinstance(value, Tensor | str) for value in _first(dataset).values()
+    ):  # no annotations in natural language
         dataset.__getitems__ = ServedFrames(dataset)  # type: ignore[attr-defined]
