@@ -37,6 +37,7 @@ def interruptions_page(folder: Path) -> str:
     trials = content["trials"]
     return (folder / "README.md").read_text().rstrip().format(
         table=markdown(rows),
+        **_long_run(folder / "long_run.json"),
         kills=total["at an operation"] + total["at a random time"],
         trials=len(trials),
         planned=content["planned"],
