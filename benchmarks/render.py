@@ -196,6 +196,8 @@ def summary(comparisons: dict[Path, tuple[Matrix, Results, list[str]]], several_
             measure = "" if entry.measure == "success" else ", mean max reward"
             link = f"[{entry.title or task}](comparison-{path.stem}.md){measure}"
             cells = [summary_cell(methods.get(name, []), entry.measure) for name in names]
+            if not any(cells):  # other methods were compared there
+                continue
             pair = (methods.get("agpd", []), methods.get("pd", []))
             rows.append((link, *cells, difference_cell(*pair, "last", entry.measure)))
     return markdown(rows)
