@@ -94,7 +94,10 @@ def distilled(tmp_path_factory, request) -> Path:
     return folder
 
 
-RECIPES = sorted(path for path in (DOCS / "recipes").glob("*.md") if commands(path))
+GENERATED = "model_card.md"  # of an example run: its commands name files that are not here
+RECIPES = sorted(
+    path for path in (DOCS / "recipes").glob("*.md") if path.name != GENERATED and commands(path)
+)
 
 
 @pytest.mark.parametrize("page", RECIPES, ids=lambda path: path.stem)

@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("h5py")
 
-from lerobot.datasets.lerobot_dataset import LeRobotDataset  # noqa: E402
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata  # noqa: E402
 from robomimic_files import column, part, run_import, write  # noqa: E402
 
 from lerobot_agpd.cli import import_robomimic as command  # noqa: E402
@@ -41,12 +41,16 @@ def test_killed_import_goes_on(rollouts, imported, tmp_path):
 
     rewritten = []
     with pytest.MonkeyPatch.context() as patch:
-        create = LeRobotDataset.create
-        patch.setattr(
-            LeRobotDataset, "create", lambda *args, **kwargs: rewritten.append(0) or create(*args, **kwargs)
-        )
+        create = LeRobotDatasetMetadata.create
+
+        def note(*args, **kwargs):
+            meta = create(*args, **kwargs)
+            rewritten.append(meta.root.name)
+            return meta
+
+        patch.setattr(LeRobotDatasetMetadata, "create", note)
         dataset = run_import(source, root, episodes_per_shard=2)
-    assert len(rewritten) == 20 - len(finished)
+    assert len([name for name in rewritten if name.startswith("shard-")]) == 20 - len(finished)
     assert (dataset.num_episodes, dataset.num_frames) == (40, 120)
     for episode in range(40):
         expected = rollouts[episode % 4].arrays["actions"][:3].astype(np.float32)
