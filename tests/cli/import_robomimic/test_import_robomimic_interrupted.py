@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip("h5py")
 
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata  # noqa: E402
 from robomimic_files import column, part, run_import, write  # noqa: E402
 
 from lerobot_agpd.cli import import_robomimic as command  # noqa: E402
@@ -18,7 +19,7 @@ from lerobot_agpd.envs.robomimic_columns import RobomimicColumns  # noqa: E402
 
 @pytest.mark.slow
 def test_killed_import_goes_on(rollouts, imported, tmp_path):
-    """`kill -9` between two shards."""
+    """`kill -9` between two shards; finished ones are not written again."""
     source = write(tmp_path / "lift.hdf5", [part(rollouts[i % 4]) for i in range(40)])
     root, partial = tmp_path / "data", tmp_path / "data.partial"
     argv = [
@@ -38,7 +39,17 @@ def test_killed_import_goes_on(rollouts, imported, tmp_path):
     finished = {path: path.stat().st_mtime_ns for path in partial.glob("shard-*/meta/info.json")}
     assert 2 <= len(finished) < 20
 
-    dataset = run_import(source, root, episodes_per_shard=2)
+    written, create = [], LeRobotDatasetMetadata.create
+
+    def note(*args, **kwargs):
+        meta = create(*args, **kwargs)
+        written.append(meta.root.name)
+        return meta
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(LeRobotDatasetMetadata, "create", note)
+        dataset = run_import(source, root, episodes_per_shard=2)
+    assert written.count("unfinished") == 20 - len(finished), "the name of a shard until it is whole"
     assert (dataset.num_episodes, dataset.num_frames) == (40, 120)
     for episode in range(40):
         expected = rollouts[episode % 4].arrays["actions"][:3].astype(np.float32)
