@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lerobot_agpd.config import FlagError
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.textures import KINDS, Textures
 
 

@@ -13,8 +13,9 @@ from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.envs import EnvConfig
 
-from lerobot_agpd.config import StudentConfig, require
+from lerobot_agpd.config import StudentConfig
 from lerobot_agpd.continuation import damaged_file, how_to_continue
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.guidance.strength import STEPS_FLAG, first_strength, require_strength
 from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.loading import check_fit, collection_environment, load_teacher, vectors

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import json
-import math
 from abc import abstractmethod
 from copy import deepcopy
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import draccus
-from diffusers.optimization import SchedulerType
-from draccus.utils import ParsingError
 from huggingface_hub.constants import CONFIG_NAME
 from huggingface_hub.utils import HFValidationError, validate_repo_id
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig
+
+from lerobot_agpd.flag_checks import FlagError, require, require_finite
 
 EVALUATION_SEEDS = (100_000, 1_000_000)
 """Environment seeds left to final evaluations; LeRobot's own evaluation during training counts up from --seed."""
@@ -36,51 +35,6 @@ RepresentationType = Literal["action", "state", "visual"]
 StrategyName = Literal["guided", "nearest", "teacher", "mixing", "rollin"]
 MixingForm = Literal["interpolate", "switch"]
 Relabel = Literal["none", "demonstrations", "all"]
-
-
-class FlagError(ParsingError):
-    """A setting that cannot be; of all errors the only kind whose text draccus shows on the command line."""
-
-
-def require(condition: bool, message: str) -> None:
-    """Raise FlagError(message) unless the condition holds."""
-    if not condition:
-        raise FlagError(message)
-
-
-def require_finite(group: object, name: str) -> None:
-    """Refuse NaN and infinite values among the fields of a group of flags, `--policy.<name>.*`.
-
-    Raises:
-        FlagError: naming the flag.
-    """
-    for entry in fields(group):  # type: ignore[arg-type]  # a dataclass
-        value = getattr(group, entry.name)
-        require(
-            not isinstance(value, float) or math.isfinite(value),
-            f"--policy.{name}.{entry.name} must be a finite number, got {value}",
-        )
-
-
-def require_at_least(config: object, least: int, *names: str) -> None:
-    """Refuse integers of a policy's configuration, `--policy.<name>`, below a limit; None is allowed.
-
-    Raises:
-        FlagError: naming the flag.
-    """
-    for name in names:
-        value = getattr(config, name)
-        require(value is None or value >= least, f"--policy.{name} must be at least {least}, got {value}")
-
-
-def require_scheduler(name: str | None) -> None:
-    """Refuse a learning rate schedule that diffusers does not have, or that needs settings of its own.
-
-    Raises:
-        FlagError: naming those there are.
-    """
-    known = [entry.value for entry in SchedulerType if entry is not SchedulerType.PIECEWISE_CONSTANT]
-    require(name is None or name in known, f"--policy.scheduler_name must be one of {known}, got '{name}'")
 
 
 @dataclass

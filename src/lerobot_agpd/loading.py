@@ -19,8 +19,9 @@ from lerobot.utils.constants import ACTION, OBS_PREFIX
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from lerobot_agpd.config import CollectConfig, FlagError, StudentConfig, TeacherConfig, require
+from lerobot_agpd.config import CollectConfig, StudentConfig, TeacherConfig
 from lerobot_agpd.files import read_json
+from lerobot_agpd.flag_checks import FlagError, require
 from lerobot_agpd.guidance.adapters import as_teacher
 from lerobot_agpd.guidance.teacher import Features, Teacher
 from lerobot_agpd.replay.gate import not_finite_statistic

@@ -11,8 +11,9 @@ from typing import Any
 
 from accelerate.utils import broadcast_object_list
 
-from lerobot_agpd.config import StudentConfig, require
+from lerobot_agpd.config import StudentConfig
 from lerobot_agpd.files import read_json
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.run import RunInfo
 
 logger = logging.getLogger(__name__)

@@ -11,7 +11,8 @@ from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_agpd.adversary import AdversaryBatch
-from lerobot_agpd.config import StudentConfig, require
+from lerobot_agpd.config import StudentConfig
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.progress import Progress
 from lerobot_agpd.replay.chunk_store import ChunkStore

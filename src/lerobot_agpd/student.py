@@ -13,7 +13,8 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 
-from lerobot_agpd.config import FlagError, StudentConfig, require
+from lerobot_agpd.config import StudentConfig
+from lerobot_agpd.flag_checks import FlagError, require
 from lerobot_agpd.guidance.discrepancy import ActionDiscrepancy, StateDiscrepancy
 from lerobot_agpd.guidance.representation import StateRepresentation
 from lerobot_agpd.guidance.teacher import History, Teacher

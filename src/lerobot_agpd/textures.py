@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from lerobot_agpd.config import require
+from lerobot_agpd.flag_checks import require
 
 Pixels = NDArray[np.uint8]
 

@@ -26,8 +26,8 @@ from lerobot.processor import (
 )
 from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
 
-from lerobot_agpd.config import FlagError, require
 from lerobot_agpd.files import read_json
+from lerobot_agpd.flag_checks import FlagError, require
 from lerobot_agpd.weights import stored_shapes
 
 Processors = tuple[

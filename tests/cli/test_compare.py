@@ -14,7 +14,7 @@ import yaml
 from rich.console import Console
 
 from lerobot_agpd.cli.compare import CompareConfig, load
-from lerobot_agpd.config import FlagError
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.studies.cluster import cluster_executor
 from lerobot_agpd.studies.jobs import Job, run_jobs
 

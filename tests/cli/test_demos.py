@@ -11,7 +11,6 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_agpd.cli import demos
 from lerobot_agpd.cli.demos import DemosConfig, record_demos, report_table
-from lerobot_agpd.config import FlagError
 from lerobot_agpd.dataset_writer import DatasetWriter
 from lerobot_agpd.envs.demonstrations import DemosReport, successful_episodes
 from lerobot_agpd.envs.experts.base import Expert
@@ -19,6 +18,7 @@ from lerobot_agpd.envs.experts.fetch import fetch_reach_expert
 from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
 from lerobot_agpd.envs.robomimic import RobomimicEnvConfig
 from lerobot_agpd.envs.robotics_tasks import TASKS
+from lerobot_agpd.flag_checks import FlagError
 
 pytest.importorskip("gymnasium_robotics")
 

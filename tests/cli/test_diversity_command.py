@@ -7,7 +7,7 @@ import pytest
 from lerobot.envs.configs import PushtEnv
 
 from lerobot_agpd.cli import diversity
-from lerobot_agpd.config import FlagError
+from lerobot_agpd.flag_checks import FlagError
 
 pytest.importorskip("gym_pusht")
 

@@ -11,7 +11,7 @@ from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 
 from lerobot_agpd.cli.export import ExportConfig, export, export_graph, load
-from lerobot_agpd.config import FlagError
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
 from lerobot_agpd.policies.agpd_diffusion.modeling_agpd_diffusion import AGPDDiffusionPolicy
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (

@@ -12,11 +12,11 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_agpd.cli import import_adroit as command
 from lerobot_agpd.cli.import_adroit import REPORT_PATH, ImportAdroitConfig, import_adroit
-from lerobot_agpd.config import FlagError
 from lerobot_agpd.envs.dapg_recordings import INITIAL_STATES, read_recordings
 from lerobot_agpd.envs.demonstrations import dataset_features
 from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
 from lerobot_agpd.envs.robotics_tasks import TASKS
+from lerobot_agpd.flag_checks import FlagError
 
 pytest.importorskip("gymnasium_robotics")
 

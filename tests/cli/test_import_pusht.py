@@ -12,8 +12,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_agpd.cli import import_pusht as command
 from lerobot_agpd.cli.import_pusht import ImportPushTConfig, import_pusht
-from lerobot_agpd.config import FlagError
 from lerobot_agpd.envs.pusht_recordings import block_geometry, load_arrays
+from lerobot_agpd.flag_checks import FlagError
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 REAL, REAL_IMAGES = DATA / "pusht_human_lowdim.npz", DATA / "pusht_human_images.npz"

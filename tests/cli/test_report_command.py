@@ -14,7 +14,7 @@ from lerobot.policies import make_pre_post_processors
 
 from lerobot_agpd.cards.model_card import ModelFacts, model_card
 from lerobot_agpd.cli import report as command
-from lerobot_agpd.config import FlagError
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
 from lerobot_agpd.policies.agpd_diffusion.modeling_agpd_diffusion import AGPDDiffusionPolicy

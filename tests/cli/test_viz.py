@@ -14,8 +14,9 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from PIL import Image
 
 from lerobot_agpd.cli import viz
-from lerobot_agpd.config import FlagError, TeacherConfig
+from lerobot_agpd.config import TeacherConfig
 from lerobot_agpd.files import write_json
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.loading import load_student
 from lerobot_agpd.progress import Progress
 from lerobot_agpd.rollout.report import RoundReport

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_agpd.config import FlagError
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.replay import stored
 
 

@@ -8,7 +8,8 @@ import yaml
 from draccus.utils import ParsingError
 from lerobot.configs.train import TrainPipelineConfig
 
-from lerobot_agpd.config import CollectConfig, FlagError, MixingConfig
+from lerobot_agpd.config import CollectConfig, MixingConfig
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig
 
 WRONG = [

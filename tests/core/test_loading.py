@@ -20,7 +20,8 @@ from tiny_policies import (
     make_teacher,
 )
 
-from lerobot_agpd.config import FlagError, GuidanceConfig, TeacherConfig
+from lerobot_agpd.config import GuidanceConfig, TeacherConfig
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.guidance.adapters.chunk import ChunkTeacher
 from lerobot_agpd.guidance.adapters.diffusion import DiffusionTeacher
 from lerobot_agpd.loading import (

@@ -11,13 +11,13 @@ from point_environment import PointEnv
 from lerobot_agpd.config import (
     AdversaryConfig,
     CollectConfig,
-    FlagError,
     GuidanceConfig,
     MixingConfig,
     ReplayConfig,
     RepresentationConfig,
     TeacherConfig,
 )
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.loading import check_fit, collection_environment, load_teacher, read_policy_config
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
 from lerobot_agpd.policies.agpd_diffusion.modeling_agpd_diffusion import AGPDDiffusionPolicy

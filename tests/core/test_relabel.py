@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from lerobot_agpd.config import AdversaryConfig, CollectConfig, FlagError, ReplayConfig
+from lerobot_agpd.config import AdversaryConfig, CollectConfig, ReplayConfig
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
 from lerobot_agpd.policies.agpd_diffusion.modeling_agpd_diffusion import AGPDDiffusionPolicy
 from lerobot_agpd.replay.replay import FRAME_INDEX

@@ -10,7 +10,7 @@ import toy_run
 from toy_run import EPISODES, ROUND_STEPS, SCALE, episodes_on_disk
 
 from lerobot_agpd import agpd as algorithm
-from lerobot_agpd.config import FlagError
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.replay.replay import FRAME_INDEX
 
 

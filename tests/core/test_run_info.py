@@ -11,7 +11,8 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.policies import make_policy
 from point_environment import PointEnv
 
-from lerobot_agpd.config import AdversaryConfig, CollectConfig, FlagError
+from lerobot_agpd.config import AdversaryConfig, CollectConfig
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
 from lerobot_agpd.run import RunInfo
 

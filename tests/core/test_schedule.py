@@ -4,7 +4,8 @@ import pytest
 from hypothesis import given, strategies as st
 
 from lerobot_agpd.agpd import rounds_due
-from lerobot_agpd.config import DEFAULT_PULL, CollectConfig, FlagError, GuidanceConfig
+from lerobot_agpd.config import DEFAULT_PULL, CollectConfig, GuidanceConfig
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.guidance.strength import GROWTH, MIN_STRENGTH, TOLERANCE, next_strength
 
 

@@ -7,11 +7,11 @@ from point_environment import PointEnv, teacher_weights
 from lerobot_agpd.config import (
     AdversaryConfig,
     CollectConfig,
-    FlagError,
     ReplayConfig,
     RepresentationConfig,
     TeacherConfig,
 )
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
 from lerobot_agpd.policies.agpd_diffusion.modeling_agpd_diffusion import AGPDDiffusionPolicy
 from lerobot_agpd.replay.replay import FRAME_INDEX

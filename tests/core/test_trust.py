@@ -10,7 +10,8 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.policies.pi0_fast.configuration_pi0_fast import PI0FastConfig
 from tiny_policies import ACT, WITH_CAMERA, make_policy
 
-from lerobot_agpd.config import FlagError, TeacherConfig
+from lerobot_agpd.config import TeacherConfig
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.loading import load_policy, load_teacher, read_policy_config
 from lerobot_agpd.replay.normalization import saved_statistics
 from lerobot_agpd.trust import PROCESSOR_FILES, admitted_packages, check_steps, require_known_policy

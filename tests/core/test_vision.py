@@ -14,12 +14,12 @@ from lerobot_agpd import build as builders
 from lerobot_agpd.config import (
     AdversaryConfig,
     CollectConfig,
-    FlagError,
     GuidanceConfig,
     ReplayConfig,
     RepresentationConfig,
     TeacherConfig,
 )
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.guidance.visual import MAP_SIZE
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
 from lerobot_agpd.replay import frame_features

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from commands import PICK, TINY_STUDENT, dataset_flags, run_here
 
-from lerobot_agpd.config import FlagError
+from lerobot_agpd.flag_checks import FlagError
 
 PROGRAM = "from pathlib import Path\nPath(__file__).with_name('imported').touch()\n\ndef run(**_): pass\n"
 

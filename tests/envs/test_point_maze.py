@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from lerobot_agpd.cli.demos import DemosConfig
-from lerobot_agpd.config import FlagError
 from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS
 from lerobot_agpd.envs.experts.point_maze import EXPERTS
 from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
 from lerobot_agpd.envs.maze_tasks import TASKS
 from lerobot_agpd.envs.point_maze import PointMazeWaysEnv
+from lerobot_agpd.flag_checks import FlagError
 
 pytest.importorskip("gymnasium_robotics")
 

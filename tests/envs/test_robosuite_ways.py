@@ -6,11 +6,11 @@ import pytest
 pytest.importorskip("robosuite")
 
 from lerobot_agpd.cli.demos import DemosConfig
-from lerobot_agpd.config import FlagError
 from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS
 from lerobot_agpd.envs.experts.lift_any import EXPERTS
 from lerobot_agpd.envs.lift_tasks import TABLE_HEIGHT, TASKS
 from lerobot_agpd.envs.robosuite_ways import RobosuiteWaysEnv
+from lerobot_agpd.flag_checks import FlagError
 
 LIFT_ANY = TASKS["LiftAny-v0"]
 

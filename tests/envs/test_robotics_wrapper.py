@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from lerobot_agpd.config import FlagError
 from lerobot_agpd.envs.base import AGENT_POS, ENVIRONMENT_STATE, PIXELS
 from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
+from lerobot_agpd.flag_checks import FlagError
 
 pytest.importorskip("gymnasium_robotics")
 

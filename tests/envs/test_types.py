@@ -14,7 +14,6 @@ from lerobot.envs import EnvConfig, make_env, preprocess_observation
 from lerobot.envs.utils import check_env_attributes_and_types, env_to_policy_features
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
-from lerobot_agpd.config import FlagError
 from lerobot_agpd.envs import (
     aloha,
     fetch_ways,
@@ -32,6 +31,7 @@ from lerobot_agpd.envs.point_maze import PointMazeWaysEnv
 from lerobot_agpd.envs.pusht import PushTStateEnvConfig
 from lerobot_agpd.envs.robomimic import RobomimicEnvConfig
 from lerobot_agpd.envs.robosuite_ways import RobosuiteWaysEnv
+from lerobot_agpd.flag_checks import FlagError
 
 KITCHEN = "FrankaKitchen-v1"
 EVERYTHING = "pixels_environment_state_agent_pos"

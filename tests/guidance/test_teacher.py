@@ -22,7 +22,7 @@ from tiny_policies import (
     make_teacher,
 )
 
-from lerobot_agpd.config import FlagError
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.guidance import adapters
 from lerobot_agpd.guidance.adapters import adapter_of, as_teacher, register_teacher
 from lerobot_agpd.guidance.adapters.chunk import ChunkTeacher

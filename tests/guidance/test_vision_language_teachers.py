@@ -4,7 +4,7 @@ import pytest
 import torch
 from tiny_policies import CAMERA, STATE, WITH_CAMERA, generator, history
 
-from lerobot_agpd.config import FlagError
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.guidance import guide as guidance
 from lerobot_agpd.guidance.adapters.flow import MultiTaskDiTTeacher
 from lerobot_agpd.guidance.adapters.rtc import RTCTeacher

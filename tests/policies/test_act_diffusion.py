@@ -6,7 +6,8 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.act.modeling_act import ACT
 
-from lerobot_agpd.config import FlagError, TeacherConfig
+from lerobot_agpd.config import TeacherConfig
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.guidance.discrepancy import ActionDiscrepancy
 from lerobot_agpd.guidance.guide import Guide
 from lerobot_agpd.loading import load_teacher

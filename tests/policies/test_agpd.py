@@ -12,12 +12,12 @@ from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot_agpd.config import (
     AdversaryConfig,
     CollectConfig,
-    FlagError,
     GuidanceConfig,
     ReplayConfig,
     RepresentationConfig,
     TeacherConfig,
 )
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.guidance.representation import LR
 from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy

@@ -8,7 +8,7 @@ from lerobot.utils.hub import HubMixin
 from safetensors.torch import load_file, save_file
 from small_diffusion import DENOISERS, fit, resumed, same, weights
 
-from lerobot_agpd.config import FlagError
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.policies.diffusion_transformer.averaged_weights import RAW_WEIGHTS
 from lerobot_agpd.policies.diffusion_transformer.modeling_diffusion_transformer import (
     DiffusionTransformerPolicy,

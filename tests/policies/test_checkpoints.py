@@ -7,7 +7,8 @@ from draccus.utils import ParsingError
 from lerobot.configs import PreTrainedConfig
 from safetensors.torch import load_file, save_file
 
-from lerobot_agpd.config import AdversaryConfig, FlagError
+from lerobot_agpd.config import AdversaryConfig
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.loading import read_policy_config
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
 

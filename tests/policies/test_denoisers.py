@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings, strategies as st
 from torch import nn
 
-from lerobot_agpd.config import FlagError
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
     MLPDenoiserConfig,
     TransformerDenoiserConfig,

@@ -14,7 +14,7 @@ from lerobot.policies.diffusion.modeling_diffusion import DiffusionConditionalUn
 from small_diffusion import DENOISERS, SMALL, B
 from torch.utils.data import default_collate
 
-from lerobot_agpd.config import FlagError
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
     DiffusionTransformerConfig,
 )

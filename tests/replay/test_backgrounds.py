@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_agpd.config import FlagError
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.replay.backgrounds import replace_backgrounds, require_masks
 from lerobot_agpd.textures import Textures
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_agpd.config import FlagError
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.replay.frames import FrameTable
 from lerobot_agpd.replay.gate import (
     FarValues,

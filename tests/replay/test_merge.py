@@ -10,7 +10,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_agpd.cli import merge as command
-from lerobot_agpd.config import FlagError
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.replay.export import check_observation, merge
 from lerobot_agpd.replay.frames import FrameTable
 from lerobot_agpd.replay.journal import EpisodeJournal

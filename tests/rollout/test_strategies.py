@@ -17,7 +17,8 @@ from toy_policies import (
 )
 
 from lerobot_agpd.agpd import GuidedStrategy, make_strategy
-from lerobot_agpd.config import CollectConfig, FlagError, GuidanceConfig, MixingConfig
+from lerobot_agpd.config import CollectConfig, GuidanceConfig, MixingConfig
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.rollout.strategies import (
     MixingStrategy,
     NearestStrategy,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lerobot_agpd.config import FlagError
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.studies.animation import (
     FAILURE,
     PAUSE,

@@ -10,7 +10,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.utils import STATS_PATH
 from matrices import MISSING, changed, content, load
 
-from lerobot_agpd.config import FlagError
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.studies.matrix import flat, load_matrix
 from lerobot_agpd.studies.parsing import decode_environment, parse_train_flags
 from lerobot_agpd.studies.provenance import digest

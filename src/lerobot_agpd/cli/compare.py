@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markdown import Markdown
 
 from lerobot_agpd.cli.command import entry_point
-from lerobot_agpd.config import require
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.studies.cluster import cluster_executor
 from lerobot_agpd.studies.comparison import REPORT, Comparison, write_report
 from lerobot_agpd.studies.jobs import Executor, run_jobs

@@ -19,13 +19,14 @@ from scipy.stats import binomtest
 
 from lerobot_agpd.cli.command import entry_point
 from lerobot_agpd.cli.progress import episode_bar
-from lerobot_agpd.config import EVALUATION_SEEDS, FlagError, require
+from lerobot_agpd.config import EVALUATION_SEEDS
 from lerobot_agpd.dataset_writer import DatasetWriter, vector
 from lerobot_agpd.envs.base import SimulatedEnvConfig
 from lerobot_agpd.envs.demonstrations import SKILL, DemosReport, dataset_features, successful_episodes
 from lerobot_agpd.envs.experts import make_expert
 from lerobot_agpd.envs.experts.base import Expert
 from lerobot_agpd.envs.experts.ways import WaysExpert
+from lerobot_agpd.flag_checks import FlagError, require
 
 logger = logging.getLogger(__name__)
 

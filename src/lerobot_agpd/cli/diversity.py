@@ -12,8 +12,9 @@ from rich.console import Console
 
 from lerobot_agpd.agpd import make_strategy
 from lerobot_agpd.cli.command import StudentFlags, entry_point
-from lerobot_agpd.config import EVALUATION_SEEDS, MixingForm, require
+from lerobot_agpd.config import EVALUATION_SEEDS, MixingForm
 from lerobot_agpd.files import write_json
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.loading import load_pair
 from lerobot_agpd.replay.episode import Episode
 from lerobot_agpd.rollout.diagnostics import ObservationReservoir

@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.table import Table
 
 from lerobot_agpd.cli.command import entry_point
-from lerobot_agpd.config import require
 from lerobot_agpd.files import write_json
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.health.dataset import examine_dataset
 from lerobot_agpd.health.finding import Finding, Severity, is_broken
 from lerobot_agpd.health.installation import examine_installation

@@ -17,8 +17,8 @@ from lerobot.utils.random_utils import seeded_context
 
 from lerobot_agpd.cards.model_card import CARD
 from lerobot_agpd.cli.command import entry_point
-from lerobot_agpd.config import require
 from lerobot_agpd.files import write_text
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.loading import LoadedPolicy, load_policy, read_policy_config
 from lerobot_agpd.onnx_policy import export_onnx, require_onnx
 from lerobot_agpd.policies.agpd.configuration_agpd import AGPDConfig

@@ -16,12 +16,12 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_agpd.cli.command import entry_point
 from lerobot_agpd.cli.progress import episode_bar
-from lerobot_agpd.config import require
 from lerobot_agpd.dataset_writer import DatasetWriter, Frame
 from lerobot_agpd.envs.dapg_recordings import Recording, read_recordings
 from lerobot_agpd.envs.demonstrations import dataset_features
 from lerobot_agpd.envs.gymnasium_robotics import GymnasiumRoboticsEnv
 from lerobot_agpd.envs.replayed_recordings import Replay, replay
+from lerobot_agpd.flag_checks import require
 
 logger = logging.getLogger(__name__)
 

@@ -13,10 +13,10 @@ from lerobot.utils.constants import ACTION, DONE, OBS_ENV_STATE, OBS_IMAGE, OBS_
 
 from lerobot_agpd.cli.command import entry_point
 from lerobot_agpd.cli.progress import episode_bar
-from lerobot_agpd.config import require
 from lerobot_agpd.dataset_writer import DatasetWriter, Frame, flag, image, vector
 from lerobot_agpd.envs.base import DESCRIPTIONS
 from lerobot_agpd.envs.pusht_recordings import IMAGE_SHAPE, Arrays, block_geometry, load_arrays
+from lerobot_agpd.flag_checks import require
 
 logger = logging.getLogger(__name__)
 

@@ -18,12 +18,12 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_agpd.cli.command import entry_point
 from lerobot_agpd.cli.progress import episode_bar
-from lerobot_agpd.config import require
 from lerobot_agpd.dataset_writer import DatasetWriter
 from lerobot_agpd.envs.robomimic_columns import DONES, REWARDS, RobomimicColumns, cameras_of, task_of
 from lerobot_agpd.envs.robomimic_hdf5 import RobomimicFile, sha256
 from lerobot_agpd.envs.robomimic_recordings import RECORDINGS_PATH, copy_recordings
 from lerobot_agpd.envs.robomimic_robot import check_robot
+from lerobot_agpd.flag_checks import require
 
 logger = logging.getLogger(__name__)
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_agpd.cli.command import entry_point
-from lerobot_agpd.config import FlagError, require
+from lerobot_agpd.flag_checks import FlagError, require
 from lerobot_agpd.replay.export import merge, upload
 
 logger = logging.getLogger(__name__)

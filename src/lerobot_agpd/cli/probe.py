@@ -15,8 +15,9 @@ from lerobot.envs import EnvConfig
 from rich.console import Console
 
 from lerobot_agpd.cli.command import entry_point, machine_device
-from lerobot_agpd.config import EVALUATION_SEEDS, TeacherConfig, require
+from lerobot_agpd.config import EVALUATION_SEEDS, TeacherConfig
 from lerobot_agpd.files import write_json
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.loading import (
     check_fit,
     check_teacher,

@@ -12,7 +12,8 @@ from rich.console import Console
 
 from lerobot_agpd.cards.model_card import add_results, environment_flags
 from lerobot_agpd.cli.command import entry_point, machine_device
-from lerobot_agpd.config import EVALUATION_SEEDS, require
+from lerobot_agpd.config import EVALUATION_SEEDS
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.progress import REPLAY_FOLDER
 from lerobot_agpd.replay.journal import EpisodeJournal
 from lerobot_agpd.rollout.report import read_reports

@@ -17,7 +17,8 @@ from rich.table import Table
 
 from lerobot_agpd.agpd import GuidedStrategy
 from lerobot_agpd.cli.command import StudentFlags, entry_point, machine_device
-from lerobot_agpd.config import EVALUATION_SEEDS, require
+from lerobot_agpd.config import EVALUATION_SEEDS
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.guidance.strength import first_strength, require_strength
 from lerobot_agpd.guidance.teacher import Teacher
 from lerobot_agpd.loading import load_pair

@@ -11,8 +11,8 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_IMAGES, OBS_STATE
 
-from lerobot_agpd.config import require
 from lerobot_agpd.envs.view import AGENT_POS, ENVIRONMENT_STATE, PIXELS, TaskSpec, View
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.textures import Textures, mask_of
 
 OBSERVED_KEYS: dict[str, tuple[str, ...]] = {

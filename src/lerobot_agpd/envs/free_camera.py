@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from lerobot_agpd.config import require
 from lerobot_agpd.envs.base import SimulatedEnvConfig, View, require_choice
 from lerobot_agpd.envs.poses import CameraPose
+from lerobot_agpd.flag_checks import require
 
 
 @dataclass

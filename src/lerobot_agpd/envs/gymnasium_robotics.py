@@ -15,12 +15,12 @@ from dataclasses import dataclass
 import gymnasium as gym
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_agpd.config import require
 from lerobot_agpd.envs.base import require_choice
 from lerobot_agpd.envs.free_camera import FreeCameraEnvConfig
 from lerobot_agpd.envs.packages import require_packages
 from lerobot_agpd.envs.poses import CameraPose
 from lerobot_agpd.envs.robotics_tasks import KITCHEN, KITCHEN_DEFAULT, KITCHEN_TASKS, TASKS
+from lerobot_agpd.flag_checks import require
 
 
 @EnvConfig.register_subclass("gymnasium_robotics")

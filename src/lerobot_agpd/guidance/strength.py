@@ -8,7 +8,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from lerobot_agpd.config import GuidanceConfig, require
+from lerobot_agpd.config import GuidanceConfig
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.guidance.pull import acts, largest_pull, scale_of_pull
 from lerobot_agpd.guidance.teacher import Teacher
 

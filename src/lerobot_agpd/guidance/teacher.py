@@ -30,7 +30,8 @@ from lerobot.utils.constants import ACTION
 from lerobot.utils.random_utils import seeded_context
 from torch import Tensor
 
-from lerobot_agpd.config import FlagError, GuidancePoint, require
+from lerobot_agpd.config import GuidancePoint
+from lerobot_agpd.flag_checks import FlagError, require
 from lerobot_agpd.guidance.action_normalizer import ActionNormalizer
 from lerobot_agpd.guidance.guide import Guide
 from lerobot_agpd.guidance.pull import Sampler

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
-from lerobot_agpd.config import FlagError
+from lerobot_agpd.flag_checks import FlagError
 
 Normalize = Callable[[str, Tensor], Tensor]
 

@@ -25,8 +25,8 @@ from lerobot.utils.constants import (
 )
 from safetensors import SafetensorError, safe_open
 
-from lerobot_agpd.config import FlagError
 from lerobot_agpd.files import read_json
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.health.finding import Finding, Severity, is_broken
 from lerobot_agpd.progress import STATE_FILE
 from lerobot_agpd.trust import PROCESSOR_FILES, check_steps

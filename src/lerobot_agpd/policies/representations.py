@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from lerobot_agpd.config import FlagError, StudentConfig, require
+from lerobot_agpd.config import StudentConfig
+from lerobot_agpd.flag_checks import FlagError, require
 from lerobot_agpd.guidance.representation import StateRepresentation
 from lerobot_agpd.guidance.visual import STUDENT, DinoEncoder, Normalize, VisualEncoder
 

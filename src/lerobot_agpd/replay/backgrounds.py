@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_agpd.config import require
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.textures import MASK_SUFFIX, Textures, mask_of
 
 

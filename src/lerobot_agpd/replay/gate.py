@@ -11,7 +11,7 @@ import torch
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from torch import Tensor
 
-from lerobot_agpd.config import require
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.replay.episode import Array
 from lerobot_agpd.replay.frames import FrameTable
 

@@ -12,7 +12,7 @@ import numpy as np
 from lerobot.utils.io_utils import write_video
 from PIL import Image, ImageDraw, ImageFont
 
-from lerobot_agpd.config import require
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.replay.episode import Array
 
 SUFFIXES = (".gif", ".mp4")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from lerobot_agpd.config import FlagError
+from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.studies.jobs import Executor
 
 

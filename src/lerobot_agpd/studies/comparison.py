@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_agpd.config import require
 from lerobot_agpd.files import write_text
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.studies.curves import draw_task_curves
 from lerobot_agpd.studies.jobs import Execute, Job
 from lerobot_agpd.studies.matrix import Matrix

@@ -21,8 +21,9 @@ from lerobot.scripts.lerobot_eval import eval_policy
 from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import seeded_context
 
-from lerobot_agpd.config import TeacherConfig, require
+from lerobot_agpd.config import TeacherConfig
 from lerobot_agpd.files import read_json, write_json
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.guidance.adapters import as_teacher
 from lerobot_agpd.loading import load_policy, read_policy_config
 from lerobot_agpd.studies.latency import Latency, chunk_latency

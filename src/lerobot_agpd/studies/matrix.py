@@ -14,7 +14,8 @@ import draccus
 import yaml
 from draccus.utils import ParsingError
 
-from lerobot_agpd.config import EVALUATION_SEEDS, require
+from lerobot_agpd.config import EVALUATION_SEEDS
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.studies.parsing import reason
 
 LABELS = {"success": "success rate", "max_reward": "mean max reward"}

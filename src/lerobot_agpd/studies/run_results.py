@@ -11,8 +11,8 @@ from typing import Any
 
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 
-from lerobot_agpd.config import require
 from lerobot_agpd.files import read_json, write_json
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.rollout.report import RoundReport, read_reports
 from lerobot_agpd.studies.evaluation import Evaluation, Evaluator, best_step, checkpoint_steps
 from lerobot_agpd.studies.latency import Latency

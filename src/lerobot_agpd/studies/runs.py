@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot_agpd.config import FlagError, require
+from lerobot_agpd.flag_checks import FlagError, require
 from lerobot_agpd.studies.matrix import Matrix, TaskEntry, flat
 from lerobot_agpd.studies.parsing import decode_environment, parse_train_flags
 

@@ -28,8 +28,8 @@ from lerobot.utils.constants import (
     TRAINING_STEP,
 )
 
-from lerobot_agpd.config import require
 from lerobot_agpd.files import read_json, write_text
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.progress import REPLAY_FOLDER
 from lerobot_agpd.studies.provenance import inputs, provenance
 from lerobot_agpd.studies.runs import Run

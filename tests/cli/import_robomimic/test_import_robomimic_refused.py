@@ -13,7 +13,7 @@ h5py = pytest.importorskip("h5py")
 from robomimic_files import ENV_ARGS, RIGHT_ARM, V141, part, run_import, write  # noqa: E402
 
 from lerobot_agpd.cli.import_robomimic import ImportRobomimicConfig  # noqa: E402
-from lerobot_agpd.config import FlagError  # noqa: E402
+from lerobot_agpd.flag_checks import FlagError  # noqa: E402
 
 
 @pytest.fixture

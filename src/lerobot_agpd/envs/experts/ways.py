@@ -6,8 +6,8 @@ from typing import Self
 
 import numpy as np
 
-from lerobot_agpd.config import require
 from lerobot_agpd.envs.experts.base import Array, Expert
+from lerobot_agpd.flag_checks import require
 
 
 class CorrelatedNoise:

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lerobot_agpd.config import require
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.guidance.guide import Guide
 from lerobot_agpd.guidance.teacher import Teacher, seeded_by
 

@@ -11,7 +11,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.utils.constants import OBS_IMAGES
 from torch import Tensor
 
-from lerobot_agpd.config import require
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.guidance.guide import Guide, guided
 from lerobot_agpd.guidance.pull import Sampler, diffusion_sampler
 from lerobot_agpd.guidance.teacher import Teacher

@@ -15,7 +15,8 @@ import torch
 from lerobot.policies.rtc import RTCConfig
 from torch import Tensor
 
-from lerobot_agpd.config import GuidancePoint, require
+from lerobot_agpd.config import GuidancePoint
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.guidance.flow import guided_velocity
 from lerobot_agpd.guidance.guide import Guide
 from lerobot_agpd.guidance.pull import Sampler, flow_sampler

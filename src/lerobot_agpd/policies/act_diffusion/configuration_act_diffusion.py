@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.act.configuration_act import ACTConfig
 
-from lerobot_agpd.config import require
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
     DiffusionTransformerConfig,
     TransformerDenoiserConfig,

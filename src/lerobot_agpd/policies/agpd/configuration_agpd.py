@@ -9,7 +9,8 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import DiffuserSchedulerConfig
 from lerobot.policies.act.configuration_act import ACTConfig
 
-from lerobot_agpd.config import StudentConfig, require, require_at_least, require_scheduler
+from lerobot_agpd.config import StudentConfig
+from lerobot_agpd.flag_checks import require, require_at_least, require_scheduler
 
 EncoderName = Literal["resnet", "resnet_group_norm", "small"]
 

@@ -8,7 +8,7 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 
-from lerobot_agpd.config import require, require_at_least, require_scheduler
+from lerobot_agpd.flag_checks import require, require_at_least, require_scheduler
 
 UNUSED_DOWN_DIMS = (16,)
 """Size of the U-Net that LeRobot's DiffusionModel always builds, where another denoiser replaces it."""

@@ -11,7 +11,7 @@ from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_agpd.cards.model_card import ModelFacts
-from lerobot_agpd.config import require
+from lerobot_agpd.flag_checks import require
 from lerobot_agpd.policies.carded import CardedPolicy
 from lerobot_agpd.policies.diffusion_transformer.averaged_weights import AveragedWeights
 from lerobot_agpd.policies.diffusion_transformer.configuration_diffusion_transformer import (
