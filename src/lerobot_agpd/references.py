@@ -95,9 +95,9 @@ def make_references(
         return chunks, References(config, replay, teacher_chunks=chunks)
     processes = PartialState()
     decisions = float(replay.table.lengths.float().mean()) / executed_steps(config, teacher)
-    per_round = math.ceil(PER_DECISION * config.collect.episodes * decisions / processes.num_processes)
-    seed += processes.process_index
-    pool = ReferencePool(sampler, replay, per_round, seed, progress.reference_frames)
+    per_round = math.ceil(PER_DECISION * config.collect.episodes * decisions)
+    rank, n_ranks = processes.process_index, processes.num_processes
+    pool = ReferencePool(sampler, replay, per_round, seed, progress.reference_frames, rank, n_ranks)
     return chunks if config.replay.relabel != "none" else None, References(config, replay, pool)
 
 

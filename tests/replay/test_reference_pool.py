@@ -14,9 +14,10 @@ def pool(small_replay):
     return make_pool(small_replay)
 
 
-def make_pool(replay, batches=None):
+def make_pool(replay, batches=None, **process):
     sampler = TeacherSampler(NotingTeacher(), replay, n_chunk_steps=4)
-    return ReferencePool(sampler, replay, per_round=3, seed=7, batches=[] if batches is None else batches)
+    batches = [] if batches is None else batches
+    return ReferencePool(sampler, replay, per_round=3, seed=7, batches=batches, **process)
 
 
 def draw(pool, n_rounds=0, n_rows=99, seed=0):
@@ -71,3 +72,18 @@ def test_new_noise_for_every_batch(pool):
     values = {int(frame): chunk for frame, chunk in zip(first.frame_index, first.chunk, strict=True)}
     for frame, chunk in zip(later.frame_index[kept], later.chunk[kept], strict=True):
         assert torch.equal(values[int(frame)], chunk)
+
+
+def test_processes_share_the_frames_and_go_on_in_any_number(pool, stored):
+    parts = [make_pool(pool.replay, rank=rank, n_ranks=2) for rank in (0, 1)]
+    drawn = [set(draw(part).frame_index.tolist()) for part in parts]
+    assert sorted(map(len, drawn)) == [1, 2] and drawn[0] | drawn[1] == set(draw(pool).frame_index.tolist())
+    assert parts[0].batches == parts[1].batches == pool.batches
+    pool.replay.extend(stored(3, 4))
+    alone = make_pool(pool.replay, parts[0].batches)
+    assert set(draw(alone).frame_index.tolist()) == drawn[0] | drawn[1]
+    many = [make_pool(pool.replay, [[4]], rank=rank, n_ranks=3) for rank in range(3)]
+    chunks = [
+        draw(part).chunk for part in many
+    ]  # fewer frames than processes: all have them, with other noise
+    assert [len(chunk) for chunk in chunks] == [1, 1, 1] and not torch.equal(chunks[0], chunks[1])
