@@ -22,10 +22,11 @@ class ServedFrames:
 
     Args:
         dataset: the dataset; the episodes that it selects are held.
+        first: its first item, for names, types and shapes.
     """
 
-    def __init__(self, dataset: LeRobotDataset):
-        first, frames = _first(dataset), dataset.hf_dataset.with_format("numpy")[:]
+    def __init__(self, dataset: LeRobotDataset, first: Item):
+        frames = dataset.hf_dataset.with_format("numpy")[:]
         self.columns = {
             key: torch.as_tensor(frames[key]).to(value.dtype).reshape(-1, *value.shape)
             for key, value in first.items()
@@ -49,13 +50,6 @@ class ServedFrames:
         return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
 
-def _first(dataset: LeRobotDataset) -> Item:
-    """The first item."""
-    item = dataset[0]
-    assert isinstance(item, dict)  # a slice delivers a list
-    return item
-
-
 def serve_from_memory(dataset: LeRobotDataset) -> None:
     """Let a loader read a dataset's batches from memory.
 
@@ -63,7 +57,7 @@ def serve_from_memory(dataset: LeRobotDataset) -> None:
     """
     if dataset.meta.camera_keys or dataset.delta_timestamps or hasattr(dataset, "__getitems__"):
         return
-    if all(
-        isinstance(value, Tensor | str) for value in _first(dataset).values()
-    ):  # no annotations in natural language
-        dataset.__getitems__ = ServedFrames(dataset)  # type: ignore[attr-defined]
+    first = dataset[0]
+    assert isinstance(first, dict)  # a slice delivers a list
+    if all(isinstance(value, Tensor | str) for value in first.values()):  # no annotations in natural language
+        dataset.__getitems__ = ServedFrames(dataset, first)  # type: ignore[attr-defined]
