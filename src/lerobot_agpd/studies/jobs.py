@@ -126,10 +126,12 @@ def run_jobs(jobs: Sequence[Job], executor: Executor, threads: int, console: Con
     commands = Commands(threads)
     columns = (SpinnerColumn(), TextColumn("runs"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: raises KeyboardInterrupt
-    waiting = {executor.submit(commands.run, job): job for job in jobs}
+    waiting: dict[Submitted, Job] = {}
     with Progress(*columns, console=console, transient=True) as bars:
         total = bars.add_task("", total=len(jobs))
         try:
+            for job in jobs:
+                waiting[executor.submit(commands.run, job)] = job
             while waiting:
                 for future in [future for future in waiting if future.done()]:
                     name, error = waiting.pop(future).name, future.exception()
