@@ -10,6 +10,7 @@ import json
 import os
 import re
 import sys
+from itertools import groupby
 from pathlib import Path
 
 import committed
@@ -37,6 +38,15 @@ SUMMARY = {"bc": "cloning", "pd": "PD", "agpd": "AGPD", "teacher": "teacher"}
 
 PUBLISHED, SAMPLERS = "DP-C, published", {"100 DDPM": "100 steps", "10 DDIM": "10 steps"}
 """Rows of the latency benchmark that the README's table shows, and what it calls their samplers."""
+
+SPEED_COLUMNS = {
+    "cpu_ms": "CPU, ms",
+    "wall_ms": "wall, ms",
+    "frames_per_s": "kept frames/s",
+    "bytes": "bytes",
+    "ratio": "ratio",
+}
+"""What the benchmark of speed measures, and the columns' names; wall time is shown where there is no CPU time."""
 
 Results = dict[str, dict[str, list[RunResult]]]
 """Task and method to results, one per training seed."""
@@ -79,41 +89,47 @@ def latency_page(path: Path) -> str:
 def speed_page(path: Path) -> str:
     """CPU time and ratios of `benchmarks/speed`, beside the ratios before its improvements."""
     content = json.loads(path.read_text())
-    before_path = path.with_name(f"{path.stem}-before.json")
-    before = json.loads(before_path.read_text())["sections"] if before_path.exists() else {}
+    sections = {name: section["rows"] for name, section in content["sections"].items()}
+    before = json.loads(path.with_name(f"{path.stem}-before.json").read_text())["sections"]
     host = content["host"]
     versions = ", ".join(f"{name} {content['versions'][name]}" for name in ("python", "torch", "lerobot"))
     machine = f"{host['cpu']}, {host['cores']} cores, {content['threads']} thread; {versions}."
     tables = {
-        name: markdown(speed_table(section["rows"], before.get(name, {}).get("rows", {})))
-        for name, section in content["sections"].items()
+        name: speed_tables(rows, before.get(name, {}).get("rows", {})) for name, rows in sections.items()
     }
-    page = text(path.parent)
-    tables |= {name: "*Not measured.*" for name in re.findall(r"\{(\w+)\}", page) if name not in tables}
-    return page.format(**{**tables, "machine": machine}) + "\n"
-
-
-def speed_table(rows: dict[str, dict[str, float]], before: dict[str, dict[str, float]]) -> list[tuple]:
-    """One row per action; a dash where something was not measured."""
-    columns = {"cpu_ms": "CPU, ms", "wall_ms": "wall, ms", "frames_per_s": "kept frames/s", "bytes": "bytes"}
-    used = [key for key in columns if any(key in row for row in rows.values())]
-    rows = {  # wall time alone where CPU time was not measured
-        name: {key: value for key, value in row.items() if key != "wall_ms" or "cpu_ms" not in row}
-        for name, row in rows.items()
+    played_ms = sections["rounds"]["environments alone"]["cpu_ms"]  # 16 episodes of 50 steps
+    numbers = {
+        "step_ms": f"{played_ms / 800:.1f}",
+        "played_s": f"{played_ms / 1e3:.2f}",
+        "wave_s": f"{50 * 125 * played_ms / 800 / 1e3:.0f}",
+        "gigabytes": f"{sections['memory']['bytes per frame in memory']['bytes'] / 1e3:.2f}",
     }
-    used = [key for key in used if any(key in row for row in rows.values())]
-    table = [("", *(columns[key] for key in used), "ratio", "before")]
-    for name, row in rows.items():
-        cells = [
-            f"{row[key]:.3g}" if key in row and row[key] < 1000 else _whole(row.get(key)) for key in used
-        ]
-        ratios = [entry.get("ratio") for entry in (row, before.get(name, {}))]
-        table.append((name, *cells, *("-" if ratio is None else f"{ratio:.2f}" for ratio in ratios)))
-    return table
+    return text(path.parent).format(**tables, **numbers, machine=machine) + "\n"
 
 
-def _whole(value: float | None) -> str:
-    return "-" if value is None else f"{value:.0f}"
+def speed_tables(rows: dict[str, dict[str, float]], before: dict[str, dict[str, float]]) -> str:
+    """One row per action; a table of its own for each group of rows of which the same was measured."""
+
+    def measured(name: str) -> list[str]:
+        keys = [key for key in SPEED_COLUMNS if key in rows[name]]
+        return [key for key in keys if key != "wall_ms" or "cpu_ms" not in keys]
+
+    tables = []
+    for keys, names in groupby(rows, key=measured):
+        table = [("", *(SPEED_COLUMNS[key] for key in keys), "before")]
+        for name in names:
+            ratio = before.get(name, {}).get("ratio")
+            cells = (speed_cell(key, rows[name][key]) for key in keys)
+            table.append((name, *cells, "-" if ratio is None else speed_cell("ratio", ratio)))
+        known = any(row[-1] != "-" for row in table[1:])
+        tables.append(markdown(table if known else [row[:-1] for row in table]))
+    return "\n\n".join(tables)
+
+
+def speed_cell(key: str, value: float) -> str:
+    if key == "ratio":
+        return f"{value:.2f}"
+    return f"{value:.3g}" if value < 1000 else f"{value:.0f}"
 
 
 def diversity_page(folder: Path) -> str:
@@ -243,6 +259,7 @@ def render(draw: bool) -> dict[Path, str]:
         pages[PAGES / f"{path.stem}.md"] = latency_page(path)
     for folder in sorted(path.parent for path in (BENCHMARKS / "diversity").glob("*/sweep.json")):
         pages[PAGES / f"diversity-{folder.name}.md"] = diversity_page(folder)
+    pages[PAGES / "speed.md"] = speed_page(BENCHMARKS / "speed" / "speed-cpu.json")
     pages[PAGES / "environments.md"] = environments_page(BENCHMARKS / "environments")
     pages[PAGES / "interruptions.md"] = interruptions_page(BENCHMARKS / "interruptions")
     pages[PAGES / "faults.md"] = faults_page(BENCHMARKS / "faults")

@@ -24,7 +24,7 @@ from lerobot_agpd.studies.provenance import provenance
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument(
-        "--sections", default=",".join(SECTIONS), help="a part, which replaces that part of the file"
+        "--sections", default=",".join(SECTIONS), help="which are measured; the file keeps the others"
     )
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--threads", type=int, default=1)
@@ -35,11 +35,11 @@ def main() -> None:
     logging.disable(logging.WARNING)
     path = options.output or Path(__file__).with_name(f"speed-{options.device}.json")
     chosen = options.sections.split(",")
-    earlier = (
-        json.loads(path.read_text())["sections"] if path.exists() and len(chosen) < len(SECTIONS) else {}
-    )
+    facts = provenance()
+    commit = facts.pop("git")
+    earlier = json.loads(path.read_text())["sections"] if path.exists() else {}
     content = {
-        **provenance(),
+        **facts,
         "device": torch.cuda.get_device_name() if options.device == "cuda" else "cpu",
         "threads": options.threads,
         "sections": earlier,
@@ -48,7 +48,8 @@ def main() -> None:
         began = time.perf_counter()
         rows = SECTIONS[name](options.device)
         seconds = time.perf_counter() - began
-        content["sections"][name] = {"seconds": seconds, "load": os.getloadavg()[0], "rows": rows}
+        load = os.getloadavg()[0]
+        content["sections"][name] = {"git": commit, "seconds": seconds, "load": load, "rows": rows}
         path.write_text(json.dumps(content, indent=1) + "\n")
         print(f"{name} ({seconds:.0f} s)")
         for row, values in rows.items():

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from pathlib import Path
 from statistics import median
 
 from loops import EXAMPLES, QUICKSTART
@@ -40,9 +39,9 @@ def first_step(device: str) -> dict[str, Row]:
     taken: dict[str, list[tuple[float, float]]] = {name: [] for name in commands}
     for _ in range(REPEATS):
         for name, command in commands.items():
-            folder = Path(tempfile.mkdtemp())
-            output = [f"--output_dir={folder}/run"] if "lerobot-train" in command[0] else []
-            taken[name].append(process_ms([*command, *output]))
+            with tempfile.TemporaryDirectory() as folder:
+                output = [f"--output_dir={folder}/run"] if "lerobot-train" in command[0] else []
+                taken[name].append(process_ms([*command, *output]))
     reference = taken["lerobot-train, act"]
     return {name: _row(times, reference) for name, times in taken.items()}
 

@@ -1,4 +1,4 @@
-"""The replay as it grows, and as demonstrations grow: appending, sampling, bytes per frame."""
+"""The replay as it grows: appending, sampling, bytes per frame."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LENGTH, EPISODES = 50, 50
 
 
 def memory(device: str) -> dict[str, Row]:
-    """Append a round of 2500 frames to T of several sizes, and draw a batch from it; then training with many demonstrations."""
+    """Append a round of 2500 frames to T of several sizes, and draw a batch from it."""
     loops = {size: grown(device, size) for size in SIZES}
     writer = loops[SIZES[0]]
     journal = writer.policy.agpd.journal
