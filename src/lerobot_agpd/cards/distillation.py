@@ -107,5 +107,4 @@ def _rounds(reports: list[RoundReport]) -> list[str]:
 
 
 def _successes(tally: Tally) -> str:
-    counted = tally.generated - tally.solved_at_start - tally.invalid
-    return f"{tally.successful} of {counted}" if counted else "-"
+    return f"{tally.successful} of {tally.counted}" if tally.counted else "-"
