@@ -39,8 +39,8 @@ def call_times(call: Callable[[], object], repeats: int, warmup: int = 3) -> lis
     for repeat in range(repeats + warmup):
         start = time.perf_counter()
         call()
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
+        if torch.accelerator.is_available():
+            torch.accelerator.synchronize()
         if repeat >= warmup:
             times.append(1e3 * (time.perf_counter() - start))
     return times
