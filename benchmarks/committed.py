@@ -20,9 +20,14 @@ RENAMED_FLAGS = {
     "policy.collect.unguided_fraction": "policy.collect.teacher_only_fraction",
     "policy.replay.collected_share": "policy.replay.collected_fraction",
 }
+PICK_AND_PLACE = ("./examples/quickstart/teacher", "./examples/fetch_pick_and_place/teacher")
+"""Folder of a teacher until now, and its folder."""
+
 RENAMED_VALUES = {
     ("policy.collect.strategy", "replay"): "teacher",
     ("env.type", "robomimic"): "robosuite_robomimic",
+    ("policy.path", PICK_AND_PLACE[0]): PICK_AND_PLACE[1],
+    ("policy.teacher.path", PICK_AND_PLACE[0]): PICK_AND_PLACE[1],
 }
 
 

@@ -14,6 +14,6 @@ settings "$output"
 [ -d "$output/few" ] || lerobot-agpd-import-pusht --source="$source_data" --root="$output/few" --first_episodes="$FEW"
 teacher "$output/teacher" "$output/many" --policy.mlp.width=640 --policy.mlp.n_blocks=4 --policy.optimizer_lr=5e-4
 cloning "$output/cloning" "$output/few"
-# Coverage above 0.95 is rare even among people: an episode is kept from 0.9 of the reward on.
+# Success is coverage above 0.95, reward 1. Here an episode is kept from a reward of 0.9 on.
 distill "$output/agpd" "$output/few" "$output/teacher" "${env[@]}" --policy.collect.min_reward=0.9
 report "$output" "${env[@]}" --title="Push-T, $FEW demonstrations"

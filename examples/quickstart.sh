@@ -17,6 +17,9 @@ if [ -e "$output" ]; then
     exit 1
 fi
 mkdir -p "$output/log"
+# Ctrl-C and failures end what runs in the background, too: each job is a process group of its own.
+set -m
+trap 'for job in $(jobs -p); do kill -- "-$job" 2>/dev/null || true; done' EXIT
 
 teacher=$here/lift_any/teacher
 last=checkpoints/last/pretrained_model
@@ -45,6 +48,7 @@ phase() {
     [ -t 1 ] && printf '\r'
     printf '%-52s %-14s %s\n' "$name" done "$(clock $((SECONDS - start)))"
 }
+wait_for() { while kill -0 "$1" 2>/dev/null; do sleep 1; done; }
 clock() { printf '%d:%02d' $(($1 / 60)) $(($1 % 60)); }
 
 # The second core clones the demonstrations, then evaluates that student and the teacher.
@@ -58,7 +62,7 @@ cloning=$!
 phase "1/4 AGPD: five rounds of $ROUND_EPISODES episodes" agpd lerobot-train "${student[@]}" "${env[@]}" \
     --output_dir="$output/agpd" --policy.teacher.path="$teacher" --policy.collect.n_envs=10 --policy.collect.rounds=5 \
     --policy.collect.warmup=$((STEPS / 6)) --policy.collect.every=$((STEPS / 6)) --policy.collect.episodes="$ROUND_EPISODES"
-phase "2/4 cloning the demonstrations, on the second core" wait_for_cloning tail --pid=$cloning -f /dev/null
+phase "2/4 cloning the demonstrations, on the second core" wait_for_cloning wait_for $cloning
 wait $cloning || { tail -n 30 "$output"/log/{cloned,first_report}.log >&2 && exit 1; }
 phase "3/4 animation and recording" viz lerobot-agpd-viz "${env[@]}" --env.visualization_width=320 \
     --env.visualization_height=320 --policy.path="$output/agpd/$last" --output="$output/guided.rrd" --png="$output/guided.png" \

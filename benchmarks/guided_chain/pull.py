@@ -4,7 +4,7 @@
    the student that the mean goes, for other spreads and distances than those the pull is computed for.
 2. ways: denoisers that are exact for a mixture of two or of three ways, sampled by the guided samplers themselves:
    probability of the way that the student leans to. Every reference spread at several pulls.
-3. quickstart: the trained teacher of examples/quickstart at its demonstrations' observations, toward a chunk that lies
+3. trained_teacher: that of examples/fetch_pick_and_place at its demonstrations' observations, toward a chunk that lies
    0.3 away from its own in every entry.
 
 usage: python benchmarks/guided_chain/pull.py          (about half a minute of processor time)
@@ -38,7 +38,7 @@ from lerobot_agpd.guidance.pull import (
 )
 from lerobot_agpd.loading import load_teacher
 
-ROOT = Path(__file__).parents[2]
+PICK_AND_PLACE = Path(__file__).parents[2] / "examples" / "fetch_pick_and_place"
 STEPS = (1, 2, 5, 10, 16, 50, 100)
 SCHEDULERS = {"DDPM": DDPMScheduler, "DDIM": DDIMScheduler}
 MIXTURE_STEPS = (5, 10, 50)
@@ -197,11 +197,11 @@ def ways() -> dict:
 # ---- 3: a trained teacher ----
 
 
-def quickstart() -> dict:
-    dataset = LeRobotDataset("local/quickstart", root=ROOT / "examples/quickstart/demonstrations")
+def trained_teacher() -> dict:
+    dataset = LeRobotDataset("local/pick", root=PICK_AND_PLACE / "demonstrations")
     chosen = range(0, len(dataset), max(len(dataset) // 32, 1))
     frames = torch.utils.data.default_collate([dataset[n] for n in chosen])
-    teacher = load_teacher(TeacherConfig(str(ROOT / "examples/quickstart/teacher")), "cpu")
+    teacher = load_teacher(TeacherConfig(str(PICK_AND_PLACE / "teacher")), "cpu")
     history = {key: frames[key][:, None].repeat(1, teacher.n_obs_steps, 1) for key in teacher.input_features}
     rows = {}
     for chain in CHAINS:
@@ -237,7 +237,7 @@ def main() -> None:
         "mixture": {"samples": N, "entries": ENTRIES, "within": WITHIN, "lean": LEAN, "center_to_way": 0.5},
         "gaussian": gaussian(),
         "ways": ways(),
-        "quickstart": quickstart(),
+        "trained_teacher": trained_teacher(),
     }
     Path(__file__).with_name("pull.json").write_text(json.dumps(result, indent=1) + "\n")
 

@@ -9,7 +9,7 @@ import tempfile
 import time
 from statistics import median
 
-from loops import EXAMPLES, QUICKSTART
+from loops import EXAMPLES, PICK_AND_PLACE
 from timing import Row
 from training import ENV, SIZES, TEACHER
 
@@ -18,7 +18,7 @@ REPEATS = 2
 
 def first_step(device: str) -> dict[str, Row]:
     """`lerobot-train --steps=1` of LeRobot's ACT and of ours with everything on."""
-    data = [f"--dataset.root={QUICKSTART}/demonstrations", "--dataset.repo_id=local/speed"]
+    data = [f"--dataset.root={PICK_AND_PLACE}/demonstrations", "--dataset.repo_id=local/speed"]
     common = [*data, f"--policy.device={device}", "--policy.push_to_hub=false", "--steps=1"]
     common += ["--save_checkpoint=false", "--env_eval_freq=0"]
     commands = {

@@ -19,14 +19,14 @@ from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import cycle
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-QUICKSTART = EXAMPLES / "quickstart"
+PICK_AND_PLACE = EXAMPLES / "fetch_pick_and_place"
 METERS = ("loss", "grad_norm", "lr", "update_s", "dataloading_s", "gpu_mem_gb")
 BATCH_SIZE = 64
 
 
 def train_config(*flags: str, preset: str | None = None, dataset: Path | None = None) -> TrainPipelineConfig:
-    """What `lerobot-train` would parse, on the quickstart's demonstrations unless told otherwise."""
-    root = dataset or QUICKSTART / "demonstrations"
+    """What `lerobot-train` would parse, on the demonstrations of FetchPickAndPlace unless told otherwise."""
+    root = dataset or PICK_AND_PLACE / "demonstrations"
     common = [f"--dataset.root={root}", "--dataset.repo_id=local/speed", "--policy.push_to_hub=false"]
     common += [f"--output_dir={tempfile.mkdtemp()}/run", "--steps=100000", f"--batch_size={BATCH_SIZE}"]
     path = EXAMPLES / "presets" / f"{preset}.yaml" if preset else None

@@ -14,7 +14,7 @@ from lerobot.envs import make_env, make_env_pre_post_processors
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 from lerobot.policies import get_policy_class, make_pre_post_processors
 from lerobot.scripts.lerobot_eval import rollout
-from loops import QUICKSTART, Loop, train_config
+from loops import PICK_AND_PLACE, Loop, train_config
 from timing import Row, in_turn
 from training import ENV, TEACHER
 
@@ -87,10 +87,10 @@ def play(envs: VectorEnv, actions: np.ndarray) -> None:
 
 def lerobots_rollout(loop: Loop, envs: VectorEnv) -> Callable[[], None]:
     """LeRobot's batched rollout of the teacher, every frame written to datasets."""
-    config = PreTrainedConfig.from_pretrained(QUICKSTART / "teacher")
+    config = PreTrainedConfig.from_pretrained(PICK_AND_PLACE / "teacher")
     config.device = loop.config.policy.device
-    policy = get_policy_class(config.type).from_pretrained(QUICKSTART / "teacher", config=config).eval()
-    processors = make_pre_post_processors(config, pretrained_path=str(QUICKSTART / "teacher"))
+    policy = get_policy_class(config.type).from_pretrained(PICK_AND_PLACE / "teacher", config=config).eval()
+    processors = make_pre_post_processors(config, pretrained_path=str(PICK_AND_PLACE / "teacher"))
     env_processors = make_env_pre_post_processors(loop.config.env, config)
 
     def run() -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import get_policy_class, make_pre_post_processors
-from loops import QUICKSTART, Loop, train_config
+from loops import PICK_AND_PLACE, Loop, train_config
 from timing import Row, in_turn
 from training import NO_ADVERSARY, NO_ROUNDS
 
@@ -65,7 +65,7 @@ def published_teacher(loop: Loop, device: str) -> Teacher:
 def guidance(device: str) -> dict[str, Row]:
     """Chunks for 16 observations."""
     loop = student(device)
-    small = load_teacher(TeacherConfig(path=str(QUICKSTART / "teacher")), device)
+    small = load_teacher(TeacherConfig(path=str(PICK_AND_PLACE / "teacher")), device)
     rows: dict[str, Row] = {}
     for sampler, (scheduler, steps) in SAMPLERS.items():
         small.set_sampler(steps, scheduler)
@@ -108,12 +108,12 @@ def _without_representation(pair: TeacherStudent) -> TeacherStudent:
 def latency(device: str) -> dict[str, Row]:
     """One chunk of one observation, by `predict_action_chunk`."""
     loop = student(device)
-    config = PreTrainedConfig.from_pretrained(QUICKSTART / "teacher")
+    config = PreTrainedConfig.from_pretrained(PICK_AND_PLACE / "teacher")
     config.device = device
-    small = get_policy_class(config.type).from_pretrained(QUICKSTART / "teacher", config=config).eval()
+    small = get_policy_class(config.type).from_pretrained(PICK_AND_PLACE / "teacher", config=config).eval()
     policies = {
         "student of the CPU preset": loop.policy,
-        "teacher of the quickstart, 10 DDIM": small,
+        "teacher of FetchPickAndPlace, 10 DDIM": small,
         "teacher of published size, 10 DDIM": published_teacher(loop, device).policy,
     }
     policies["teacher of published size, 10 DDIM"].diffusion.num_inference_steps = 10

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import torch
-from loops import QUICKSTART, Floor, Loop, train_config
+from loops import PICK_AND_PLACE, Floor, Loop, train_config
 from timing import Row, in_turn
 
 TURNS, STEPS = 7, 4
 """Four steps per turn: the preset's adversary acts in every fourth."""
 
 ENV = ("--env.type=gymnasium_robotics", "--env.task=FetchPickAndPlace-v4")
-TEACHER = f"--policy.teacher.path={QUICKSTART}/teacher"
+TEACHER = f"--policy.teacher.path={PICK_AND_PLACE}/teacher"
 NO_ROUNDS, NO_ADVERSARY = "--policy.collect.every=0", "--policy.adversary.weight=0"
 SIZES = (
     "--policy.chunk_size=16",

@@ -7,7 +7,8 @@ from huggingface_hub import ModelCard
 from lerobot.envs.configs import PushtEnv
 
 from lerobot_agpd.cards import install
-from lerobot_agpd.cards.model_card import ModelFacts, add_results, environment_flags, model_card
+from lerobot_agpd.cards.model_card import EXTRAS, ModelFacts, add_results, environment_flags, model_card
+from lerobot_agpd.plugin import ENV_TYPES
 
 
 def facts(**changed) -> ModelFacts:
@@ -40,6 +41,10 @@ def test_the_evaluation_command_selects_the_environment(agpd_config):
     card = model_card(agpd_config(repo_id="me/student"), facts(env=env))
     assert "lerobot-eval --policy.path=me/student " + " ".join(flags) in card.text
     assert "lerobot_policy_agpd[pusht] @ git+" in card.text
+
+
+def test_every_environment_of_the_plugin_names_the_extra_that_installs_it():
+    assert set(ENV_TYPES) <= set(EXTRAS)
 
 
 def test_a_later_evaluation_replaces_the_earlier_one(agpd_config, tmp_path):

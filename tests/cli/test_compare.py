@@ -138,14 +138,14 @@ STEPS, SAVE = 30, 10
 
 
 def tiny_matrix(folder: Path) -> Path:
-    quickstart = ROOT / "examples" / "quickstart"
+    example = ROOT / "examples" / "fetch_pick_and_place"
     content = {
         "tasks": {
             "pick": {
                 "title": "FetchPickAndPlace",
                 "env": {"type": "gymnasium_robotics", "task": "FetchPickAndPlace-v4"},
-                "dataset": {"repo_id": "local/pick", "root": str(quickstart / "demonstrations")},
-                "teacher": str(quickstart / "teacher"),
+                "dataset": {"repo_id": "local/pick", "root": str(example / "demonstrations")},
+                "teacher": str(example / "teacher"),
             }
         },
         "methods": {

@@ -1,4 +1,4 @@
-"""`lerobot-agpd-probe` on the quickstart's teacher, and what it refuses."""
+"""`lerobot-agpd-probe` on the teacher of FetchPickAndPlace, and what it refuses."""
 
 import json
 import sys
@@ -11,11 +11,11 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_agpd.cli import probe
 
-QUICKSTART = Path(__file__).parents[2] / "examples/quickstart"
+EXAMPLE = Path(__file__).parents[2] / "examples/fetch_pick_and_place"
 FLAGS = {
-    "teacher.path": str(QUICKSTART / "teacher"),
+    "teacher.path": str(EXAMPLE / "teacher"),
     "dataset.repo_id": "local/fetch_pick_and_place",
-    "dataset.root": str(QUICKSTART / "demonstrations"),
+    "dataset.root": str(EXAMPLE / "demonstrations"),
     "states": 3,
     "samples": 24,
 }
@@ -28,7 +28,7 @@ def call(monkeypatch, output, **changes) -> None:
     probe.main()
 
 
-def test_the_quickstart_s_teacher_has_one_way(monkeypatch, tmp_path, capsys):
+def test_a_teacher_with_one_way(monkeypatch, tmp_path, capsys):
     call(monkeypatch, tmp_path / "probe")
     content = json.loads((tmp_path / "probe/probe.json").read_text())
     assert content["verdict"]["finding"] == "one way"
@@ -95,7 +95,7 @@ def test_success_by_denoising_steps(monkeypatch, tmp_path):
         ({"episodes": 1}, "--episodes must be at least 2"),
         ({"batch_size": 0}, "--batch_size must be at least 1"),
         ({"env_seed": 5}, "--env_seed=5"),
-        ({"policy.path": QUICKSTART / "teacher"}, "--policy.path=.* has no teacher"),
+        ({"policy.path": EXAMPLE / "teacher"}, "--policy.path=.* has no teacher"),
         ({"teacher.num_inference_steps": 101}, "teacher.num_inference_steps=101 exceeds"),
         (
             {"env.type": "gymnasium_robotics", "env.task": "FetchReach-v4"},

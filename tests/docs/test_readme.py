@@ -45,5 +45,17 @@ def test_links_lead_somewhere(page: Path) -> None:
     assert not missing
 
 
+@pytest.mark.parametrize(
+    "page",
+    [page for page in PAGES if "--8" in page.read_text()],
+    ids=lambda path: str(path.relative_to(ROOT)),
+)
+def test_included_files_are_there(page: Path) -> None:
+    """A formatter of Python may rewrite the mark, which the site would then show."""
+    for mark in re.findall(r"^--8.*$", page.read_text(), re.MULTILINE):
+        (file,) = re.findall(r'^--8<-- "(.+)"$', mark)
+        assert (ROOT / file).is_file()
+
+
 def test_the_first_page_is_short() -> None:
     assert len((ROOT / "README.md").read_text().splitlines()) <= 120

@@ -1,4 +1,4 @@
-"""Demonstrations and teacher of the end-to-end tests: the quickstart's."""
+"""Demonstrations and teacher of the end-to-end tests: those of FetchPickAndPlace in examples/."""
 
 import os
 from pathlib import Path
@@ -8,16 +8,16 @@ from commands import EXAMPLES
 
 os.environ.setdefault("MUJOCO_GL", "egl")  # before anything renders
 
-QUICKSTART = EXAMPLES / "quickstart"
+PICK_AND_PLACE = EXAMPLES / "fetch_pick_and_place"
 
 
 @pytest.fixture
 def fetch_demos() -> Path:
     """Ten expert episodes of FetchPickAndPlace."""
-    return QUICKSTART / "demonstrations"
+    return PICK_AND_PLACE / "demonstrations"
 
 
 @pytest.fixture
 def fetch_teacher() -> Path:
     """A diffusion teacher that picks and places."""
-    return QUICKSTART / "teacher"
+    return PICK_AND_PLACE / "teacher"

@@ -85,8 +85,8 @@ def distilled(tmp_path_factory, request) -> Path:
     (folder / "examples").symlink_to(EXAMPLES)
     checkpoints = folder / "outputs" / "teacher" / "checkpoints" / "last"
     checkpoints.mkdir(parents=True)
-    (checkpoints / "pretrained_model").symlink_to(EXAMPLES / "quickstart" / "teacher")
-    (folder / "outputs" / "demonstrations").symlink_to(EXAMPLES / "quickstart" / "demonstrations")
+    (checkpoints / "pretrained_model").symlink_to(EXAMPLES / "fetch_pick_and_place" / "teacher")
+    (folder / "outputs" / "demonstrations").symlink_to(EXAMPLES / "fetch_pick_and_place" / "demonstrations")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         (distill,) = [words for words in commands(TUTORIAL) if "--output_dir=outputs/student" in words]

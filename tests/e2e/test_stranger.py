@@ -15,7 +15,7 @@ PROGRAM = "from pathlib import Path\nPath(__file__).with_name('imported').touch(
 
 @pytest.fixture
 def stranger(fetch_teacher: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The quickstart's teacher, whose postprocessor ends with a program."""
+    """The example's teacher, whose postprocessor ends with a program."""
     monkeypatch.syspath_prepend(tmp_path / "programs")
     (tmp_path / "programs").mkdir()
     (tmp_path / "programs" / "agpd_program.py").write_text(PROGRAM)

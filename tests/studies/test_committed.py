@@ -21,12 +21,14 @@ PARTS = ("strategy", "teacher_only", "retried", "student_alone")
 def test_flags_have_todays_names():
     old = {"policy.collect.strategy": "replay", "policy.replay.collected_share": 0.5, "env.type": "robomimic"}
     old |= {"policy.collect.unguided_fraction": 0.2, "policy.collect.mixing.relabel": True, "seed": 1000}
+    old |= {"policy.teacher.path": "./examples/quickstart/teacher"}
     assert committed.flags(old) == {
         "policy.collect.strategy": "teacher",
         "policy.replay.collected_fraction": 0.5,
         "env.type": "robosuite_robomimic",
         "policy.collect.teacher_only_fraction": 0.2,
         "policy.collect.mixing.record_teacher": True,
+        "policy.teacher.path": "./examples/fetch_pick_and_place/teacher",
         "seed": 1000,
     }
 

@@ -27,6 +27,10 @@ COLLECTED = """\
 A frozen teacher acted in simulation, the episodes that succeeded joined the demonstrations, and the policy imitated both
 (*Adaptive Guidance Policy Distillation*, AGPD). It needs neither teacher nor dataset to act."""
 
+SELF_TAUGHT = """\
+In every collection round it acted in simulation, guided toward what it had been a round before. The episodes that succeeded
+joined the demonstrations, and it imitated both (self-distillation by *Adaptive Guidance Policy Distillation*, AGPD)."""
+
 OFFLINE = """\
 It was distilled from a frozen teacher at the states of the demonstrations. It needs neither teacher nor dataset to act."""
 
@@ -54,7 +58,10 @@ def distillation_facts(agpd: AGPD, n_parameters: int, dataset: LeRobotDatasetMet
         "training steps": f"{progress.step} of {agpd.run.steps or 'unknown'}",
     }
     kind = KINDS.get(config.type, config.type)
-    explanation = COLLECTED if config.collect.enabled else OFFLINE if config.uses_teacher else CLONED
+    if config.collect.enabled:
+        explanation = COLLECTED if teacher else SELF_TAUGHT
+    else:
+        explanation = OFFLINE if config.uses_teacher else CLONED
     article = "An" if kind[0] in "AEIOU" else "A"
     return ModelFacts(
         summary=f"{article} {kind} policy for [LeRobot](https://github.com/huggingface/lerobot). {explanation}",
@@ -107,5 +114,4 @@ def _rounds(reports: list[RoundReport]) -> list[str]:
 
 
 def _successes(tally: Tally) -> str:
-    counted = tally.generated - tally.solved_at_start - tally.invalid
-    return f"{tally.successful} of {counted}" if counted else "-"
+    return f"{tally.successful} of {tally.counted}" if tally.counted else "-"

@@ -27,10 +27,12 @@ Not evaluated yet. `lerobot-agpd-report` evaluates the checkpoint and writes its
 
 EXTRAS = {
     "pusht": "pusht",
+    "pusht_state": "pusht",
     "aloha": "aloha",
     "aloha_state": "aloha",
     "gymnasium_robotics": "fetch",
     "fetch_ways": "fetch",
+    "point_maze_ways": "fetch",
     "robosuite_robomimic": "robomimic",
     "robosuite_ways": "robomimic",
 }
@@ -123,7 +125,7 @@ def environment_flags(env: EnvConfig) -> list[str]:
 
 def _training(resumed: bool) -> str:
     """How the policy was trained: the command, if there was one, and where all settings are."""
-    program = Path(sys.argv[0]).name
+    program = Path(sys.argv[0]).stem.replace("_", "-")  # with torchrun it is lerobot_train.py
     command = shlex.join([program, *sys.argv[1:]]) if program == "lerobot-train" else None
     text = "## How it was trained\n\n`train_config.json` in this folder has every setting. "
     if command is None:

@@ -145,7 +145,7 @@ def run_part(name: str, run: Path, result: Result, config: ReportConfig) -> RunP
     journal, pictures = EpisodeJournal(run / REPLAY_FOLDER), {}
     if config.sheet_episodes and result.rounds:
         number = len(result.rounds) - 1
-        sheet = config.output / f"sheet-{number}-{run.name}.png"
+        sheet = config.output / f"sheet-{list(config.runs).index(name)}.png"
         draw_contact_sheet(journal, number, config.env, config.sheet_episodes, sheet)
         pictures[f"Round {number}: where kept episodes ended, and where dropped ones began"] = sheet
     checkpoint, flags = last_checkpoint(run), environment_flags(config.env)

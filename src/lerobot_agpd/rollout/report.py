@@ -41,11 +41,16 @@ class Tally:
             invalid=len(records) - len(valid),
         )
 
+    @property
+    def counted(self) -> int:
+        """Valid episodes that were not solved at the start: those that a success rate is over."""
+        return self.generated - self.solved_at_start - self.invalid
+
 
 def success_rate(tallies: Iterable[Tally]) -> float | None:
     """Success rate over the valid episodes of several tallies that were not solved at the start; None without any."""
     tallies = list(tallies)
-    counted = sum(tally.generated - tally.solved_at_start - tally.invalid for tally in tallies)
+    counted = sum(tally.counted for tally in tallies)
     return sum(tally.successful for tally in tallies) / counted if counted else None
 
 

@@ -90,21 +90,26 @@ def outcome_table(methods: Methods, measure: str, reference: str | None) -> list
     if reference is not None:
         rows[0] += (f"minus `{reference}`",)
     for name, runs in methods.items():
-        trained = runs[0].steps is not None
-        by_seed = [f"{pooled([result], 'last', measure).mean:.2f}" for result in runs]
-        cells = [
-            name,
-            str(len(runs)) if trained else "-",
-            str(runs[0].steps) if trained else "-",
-            str(pooled(runs, "last", measure)),
-            " / ".join(by_seed) if len(runs) > 1 else "-",
-        ]
+        cells = _outcome(name, runs, measure, str(len(runs)))
         if reference is not None:
             cells.append(
                 "" if name == reference else difference_cell(runs, methods[reference], "last", measure)
             )
         rows.append(tuple(cells))
     return rows
+
+
+def _outcome(name: str, runs: Sequence[RunResult], measure: str, n_seeds: str) -> list[str]:
+    """Name, training seeds, gradient steps, the measure at the last checkpoint, and the same by seed."""
+    trained = runs[0].steps is not None
+    by_seed = [f"{pooled([result], 'last', measure).mean:.2f}" for result in runs]
+    return [
+        name,
+        n_seeds if trained else "-",
+        str(runs[0].steps) if trained else "-",
+        str(pooled(runs, "last", measure)),
+        " / ".join(by_seed) if len(runs) > 1 else "-",
+    ]
 
 
 def results_table(methods: Methods, measure: str, n_seeds: int) -> list[Row]:
@@ -122,15 +127,8 @@ def results_table(methods: Methods, measure: str, n_seeds: int) -> list[Row]:
     rows: list[Row] = [tuple(header)]
     for name, runs in methods.items():
         trained = runs[0].steps is not None
-        by_seed = [f"{pooled([result], 'last', measure).mean:.2f}" for result in runs]
-        cells = [
-            name,
-            f"{len(runs)} of {n_seeds}" if trained else "-",
-            str(runs[0].steps) if trained else "-",
-            str(pooled(runs, "last", measure)),
-            " / ".join(by_seed) if len(runs) > 1 else "-",
-            str(pooled(runs, "best", measure)) if trained else "-",
-        ]
+        cells = _outcome(name, runs, measure, f"{len(runs)} of {n_seeds}")
+        cells.append(str(pooled(runs, "best", measure)) if trained else "-")
         for kind in others:
             cells += [str(pooled(runs, "last", kind)), str(pooled(runs, "best", kind)) if trained else "-"]
         rows.append(tuple(cells))
@@ -284,5 +282,4 @@ def rounds_table(rounds: Sequence[RoundReport]) -> list[Row]:
 
 
 def _successes(tally: Tally) -> str:
-    counted = tally.generated - tally.solved_at_start - tally.invalid
-    return f"{tally.successful} / {counted}" if counted else "-"
+    return f"{tally.successful} / {tally.counted}" if tally.counted else "-"
