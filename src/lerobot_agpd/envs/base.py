@@ -74,7 +74,7 @@ class SimulatedEnvConfig(EnvConfig):
     visualization_width: int = 480
     # Draw shadows; without a GPU an image is several times faster without.
     shadows: bool = True
-    # Draw smooth edges; without a GPU an image is several times faster without.
+    # Draw smooth edges; without a GPU an image is faster without.
     antialiasing: bool = True
     # Show masks too, one image per camera, <camera>_mask: white where nothing can move.
     masks: bool = False

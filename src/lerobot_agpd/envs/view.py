@@ -43,7 +43,7 @@ class View:
         observation_size: of observed images.
         visualization_size: of rendered frames.
         shadows: whether images show them; without a GPU they take most of the time.
-        antialiasing: whether edges are smooth; without a GPU an image is several times faster without.
+        antialiasing: whether edges are smooth; without a GPU an image is faster without.
         poses: of those cameras that are not the model's.
         masks: whether the background's mask is observed with every camera.
         main_pose: of rendered frames, and of an observed image without a name; None: the environment's own.
