@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# From pixels: the teacher of fetch_pick_and_place/ sees the state, its student two cameras. From demonstrations to
-# a table; an hour or so on one CPU core, of which software rendering takes a third.
+# From pixels: a teacher sees the state of FetchPickAndPlace, its student two cameras. From demonstrations to a table. On a
+# CPU this takes hours: 1500 steps of one student took half an hour (docs/results/comparison-fetchpick_cameras.md).
 # usage: examples/vision.sh [output folder]
 FEW=${FEW:-10}
 source "$(dirname "$0")/common.sh"
 output=${1:-outputs/vision}
-teacher=$(dirname "$0")/fetch_pick_and_place/teacher
+teacher=$(dirname "$0")/quickstart/teacher
 env=(--env.type=gymnasium_robotics --env.task=FetchPickAndPlace-v4 --env.obs_type=pixels_environment_state_agent_pos
     '--env.cameras=["front","side"]' --env.antialiasing=false)
 student=(--config_path="$presets/vision_student_cpu.yaml" --dataset.repo_id=local/vision --dataset.root="$output/few"

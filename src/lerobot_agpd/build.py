@@ -4,22 +4,28 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from accelerate import PartialState
-from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.envs import EnvConfig
 
+from lerobot_agpd.before_training import (
+    check_environment,
+    check_steps,
+    check_strength,
+    require_intact,
+    warn_of_settings,
+)
 from lerobot_agpd.config import StudentConfig
-from lerobot_agpd.continuation import damaged_file, how_to_continue
+from lerobot_agpd.fit import check_fit, vectors
 from lerobot_agpd.flag_checks import require
-from lerobot_agpd.guidance.strength import STEPS_FLAG, first_strength, require_strength
 from lerobot_agpd.guidance.teacher import Teacher
-from lerobot_agpd.loading import check_fit, collection_environment, load_teacher, vectors
-from lerobot_agpd.progress import REPLAY_FOLDER, Progress, find_replay_root
+from lerobot_agpd.identity import chunk_identity, episode_identity
+from lerobot_agpd.loading import collection_environment, load_teacher
+from lerobot_agpd.progress import Progress, find_replay_root
 from lerobot_agpd.references import References, make_references
 from lerobot_agpd.replay.backgrounds import require_masks
 from lerobot_agpd.replay.chunk_store import FOLDER, ChunkStore
@@ -31,11 +37,10 @@ from lerobot_agpd.replay.normalization import Statistics
 from lerobot_agpd.replay.replay import Replay
 from lerobot_agpd.replay.teacher_chunks import TeacherChunks
 from lerobot_agpd.rollout.collector import Collector
-from lerobot_agpd.rollout.first_observation import first_observation
 from lerobot_agpd.rollout.report import RoundReport, read_reports
 from lerobot_agpd.run import RunInfo
 from lerobot_agpd.self_distillation import SelfTeacher
-from lerobot_agpd.student import Student, executed_steps
+from lerobot_agpd.student import Student
 from lerobot_agpd.textures import Textures
 
 logger = logging.getLogger(__name__)
@@ -105,13 +110,13 @@ def build_parts(
     )
     dataset_meta = require_dataset(dataset_meta)
     progress = Progress.restore(config, run)
-    _require_intact(progress)
+    require_intact(progress)
     self_teacher = _self_teacher(student, progress)
     teacher = None if self_teacher else _teacher(config)
     env_config = collection_environment(config.collect, run) if config.collect.enabled else None
     check_fit(config, teacher, dataset_meta, env_config)
-    seen_by_teacher = vectors(teacher.input_features) if teacher else []
-    demonstrations = DemonstrationFrames(config, dataset_meta, dataset_stats, seen_by_teacher)
+    also_held = vectors(teacher.input_features) if teacher else []
+    demonstrations = DemonstrationFrames(config, dataset_meta, dataset_stats, also_held)
     meta = demonstrations.dataset.meta
     replay = Replay(
         demonstrations,
@@ -124,15 +129,12 @@ def build_parts(
     collector, journal = None, None
     root = _root(config, run, progress)
     if env_config is not None:
-        _check_steps(student, teacher, demonstrations)
-        _check_strength(config, teacher, self_teacher, meta.stats or {})
-        _warn_of_settings(config)
+        check_steps(student, teacher, demonstrations)
+        check_strength(config, teacher, self_teacher, meta.stats or {})
+        warn_of_settings(config)
         journal = _journal(config, root, progress, meta, env_config, seed)
         check = partial(check_observation, meta.features)
-        if config.image_features or (teacher and len(seen_by_teacher) < len(teacher.input_features)):
-            check(
-                first_observation(env_config, config)
-            )  # environments declare sizes that they do not always deliver
+        check_environment(config, teacher, env_config, check)
         rank, n_ranks = processes.process_index, processes.num_processes
         collector = Collector(config, env_config, meta, journal, check, seed, rank, n_ranks)
     teacher_chunks, references = make_references(
@@ -153,24 +155,6 @@ def build_parts(
         seed=seed,
         rank=processes.process_index,
     )
-
-
-def _require_intact(progress: Progress) -> None:
-    """Refuse a checkpoint with a damaged file, which LeRobot would read later, and name neither path nor remedy.
-
-    Raises:
-        ValueError: naming the file, and how the run goes on.
-    """
-    if progress.checkpoint is None:
-        return
-    folder = progress.checkpoint.parent
-    damaged = damaged_file(folder)
-    if damaged is not None:
-        run_folder = folder.parent.parent
-        raise ValueError(
-            f"{damaged} is damaged; restore it, or continue from another checkpoint: "
-            f"{how_to_continue(run_folder, run_folder / REPLAY_FOLDER)}"
-        )
 
 
 def _backgrounds(
@@ -239,14 +223,7 @@ def _chunk_store(config: StudentConfig, replay: Replay, seed: int, root: Path | 
     """Where the teacher's chunks at recorded frames are kept, beside the journal."""
     if root is None:
         return None
-    dataset = replay.demonstrations.dataset.meta
-    weights = Path(config.teacher.path) / SAFETENSORS_SINGLE_FILE
-    identity = {
-        **asdict(config.teacher),
-        "weights": [weights.stat().st_size, weights.stat().st_mtime_ns] if weights.is_file() else None,
-        "demonstrations": [dataset.repo_id, str(dataset.root), dataset.total_frames],
-        "seed": seed,
-    }
+    identity = chunk_identity(config, replay.demonstrations.dataset.meta, seed)
     return ChunkStore(root.with_name(FOLDER), identity, writes=PartialState().is_main_process)
 
 
@@ -272,40 +249,13 @@ def _journal(
     """The journal of the run's episodes; notes its folder in `progress`."""
     assert root is not None
     progress.replay_root = str(root)
-    identity = _identity(config, env_config, seed)
+    identity = episode_identity(config, env_config, seed)
     journal = EpisodeJournal(root)
     processes = PartialState()
     if processes.is_main_process:
         journal.begin(demonstrations, identity, resume=progress.checkpoint is not None)
     processes.wait_for_everyone()
     return journal
-
-
-def _identity(config: StudentConfig, env_config: EnvConfig, seed: int) -> dict[str, object]:
-    """What decides a run's episodes, by flag; settings of another strategy than the run's are left out."""
-    collect = config.collect
-    identity: dict[str, object] = {
-        "strategy": collect.strategy,
-        "environment": {"type": env_config.type, "task": env_config.task},
-        "teacher": config.teacher.path,
-        "seed": seed,
-        "teacher.num_inference_steps": config.teacher.num_inference_steps,
-        "teacher.noise_scheduler": config.teacher.noise_scheduler,
-        "collect.n_action_steps": collect.n_action_steps,
-        "collect.min_reward": collect.min_reward,
-        "collect.keep_failures": collect.keep_failures,
-    }
-    if collect.guides:
-        identity |= {f"guidance.{name}": value for name, value in asdict(config.guidance).items()}
-    if collect.guides or collect.strategy == "nearest":
-        identity["representation.type"] = config.representation.type
-        if config.representation.type == "visual":
-            identity["representation.encoder"] = config.representation.encoder
-    if collect.strategy == "mixing":
-        identity["collect.mixing"] = asdict(collect.mixing)
-    if collect.strategy == "nearest":
-        identity["collect.nearest_samples"] = collect.nearest_samples
-    return identity
 
 
 def _adopt_rounds(
@@ -328,65 +278,3 @@ def _adopt_rounds(
     if later:
         logger.info("%d finished rounds of %s enter T when training reaches them", len(later), journal.root)
     return used
-
-
-def _check_steps(student: Student, teacher: Teacher | None, demonstrations: DemonstrationFrames) -> None:
-    """Refuse numbers of executed steps that a round, or the learned J, could not work with."""
-    n_steps, representation = executed_steps(student.config, teacher), student.representation
-    if representation is None:
-        return
-    flag = f"--policy.representation.type={student.config.representation.type}"
-    require(
-        n_steps == representation.n_steps,
-        f"{flag} predicts {representation.n_steps} steps ahead, and rounds execute "
-        f"{n_steps} (the teacher's own number); set --policy.collect.n_action_steps={n_steps}",
-    )
-    longest = int(demonstrations.table.lengths.max())
-    require(
-        longest > n_steps,
-        f"{flag} predicts {n_steps} steps ahead, and no demonstration is longer than "
-        f"{longest}; set --policy.collect.n_action_steps below that",
-    )
-    collect = student.config.collect
-    require(
-        not (collect.strategy == "mixing" and collect.mixing.record_teacher),
-        "--policy.collect.mixing.record_teacher=true records actions that were not executed, and "
-        f"{flag} learns what recorded actions lead to; use --policy.replay.relabel=all",
-    )
-
-
-def _check_strength(
-    config: StudentConfig,
-    teacher: Teacher | None,
-    self_teacher: SelfTeacher | None,
-    stats: Statistics,
-) -> None:
-    """Refuse a first round that guides more strongly than the teacher's denoising steps can follow."""
-    guidance, steps_flag = config.guidance, STEPS_FLAG
-    if self_teacher is not None:
-        teacher = self_teacher.unchanged(stats)
-        steps_flag = "--policy.num_inference_steps"
-    if config.needs_guidance and teacher is not None:
-        require_strength(teacher, first_strength(teacher, guidance), guidance, steps_flag)
-
-
-def _warn_of_settings(config: StudentConfig) -> None:
-    """Warn of settings that are allowed and seldom intended."""
-    collect = config.collect
-    adapts = config.guidance.adaptive and config.guidance.first_strength > 0 and config.needs_guidance
-    if adapts and int(collect.episodes * collect.teacher_only_fraction) == 0:
-        logger.warning(
-            "--policy.collect.teacher_only_fraction=%s of --policy.collect.episodes=%d is less than one episode: the "
-            "teacher's own success rate stays unknown and the %s of guidance at %s",
-            collect.teacher_only_fraction,
-            collect.episodes,
-            config.guidance.unit,
-            config.guidance.first_strength,
-        )
-    teacher_recorded = collect.strategy == "mixing" and collect.mixing.record_teacher
-    if collect.keep_failures and config.replay.relabel != "all" and not teacher_recorded:
-        logger.warning(
-            "--policy.collect.keep_failures=true with --policy.replay.relabel=%s: the student imitates the failures "
-            "as they were recorded; --policy.replay.relabel=all gives it the teacher's chunks there",
-            config.replay.relabel,
-        )

@@ -19,6 +19,9 @@ KINDS = ("noise", "stripes")
 MASK_SUFFIX = "_mask"
 """What the name of a camera's mask ends with; masks are white where the background is."""
 
+PICTURE_SIZE = 640
+"""Longest side of a picture that is held in memory, pixels: photographs are made smaller once."""
+
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 
 
@@ -85,4 +88,6 @@ def _cut(picture: Image.Image, rng: np.random.Generator, height: int, width: int
 @lru_cache(maxsize=256)
 def _picture(path: Path) -> Image.Image:
     with Image.open(path) as file:
-        return file.convert("RGB")
+        picture = file.convert("RGB")
+    picture.thumbnail((PICTURE_SIZE, PICTURE_SIZE))
+    return picture

@@ -4,14 +4,17 @@ from dataclasses import dataclass, field
 
 import gymnasium as gym
 import numpy as np
+import point_environment
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import EnvConfig
-from point_environment import FPS, GAIN, LIMIT, Point, PointTeacher
+from point_environment import FEATURE_NAMES, FPS, LIMIT, Point, PointEnv, PointTeacher
 from small_dataset import FEATURES
 
 NAME = "lerobot_agpd_tests/PointCamera-v0"
 STATE, ENV, IMAGE = "observation.state", "observation.environment_state", "observation.image"
+MASK = f"{IMAGE}_mask"
+NAMES = {**FEATURE_NAMES, "pixels": IMAGE}
 SIZE = 24
 
 
@@ -32,41 +35,34 @@ class PointCamera(Point):
         return {**super().observation(), "pixels": pixels}
 
 
+class MaskedPointCamera(PointCamera):
+    """With a mask beside the image: the lower half is the background."""
+
+    def observation(self):
+        observation = super().observation()
+        mask = np.zeros_like(observation["pixels"])
+        mask[self.size // 2 :] = 255
+        return {**observation, "mask": mask}
+
+
 if NAME not in gym.registry:
     gym.register(NAME, entry_point=PointCamera, max_episode_steps=LIMIT)
 
 
 @EnvConfig.register_subclass("agpd_test_point_camera")
 @dataclass
-class PointCameraEnv(EnvConfig):
+class PointCameraEnv(PointEnv):
     """`--env.type=agpd_test_point_camera`; `shown` raw keys."""
 
     task: str | None = "PointCamera-v0"
-    fps: int = FPS
     size: int = SIZE
     shown: tuple[str, ...] = ("agent_pos", "environment_state", "pixels")
-    features: dict[str, PolicyFeature] = field(default_factory=dict)
-    features_map: dict[str, str] = field(
-        default_factory=lambda: {
-            "action": "action",
-            "agent_pos": STATE,
-            "environment_state": ENV,
-            "pixels": IMAGE,
-        }
-    )
+    features_map: dict[str, str] = field(default_factory=lambda: {"action": "action", **NAMES})
 
     def __post_init__(self):
-        all_features = {
-            "agent_pos": PolicyFeature(FeatureType.STATE, (2,)),
-            "environment_state": PolicyFeature(FeatureType.ENV, (3,)),
-            "pixels": PolicyFeature(FeatureType.VISUAL, (SIZE, SIZE, 3)),  # whatever it delivers
-        }
-        self.features = {key: all_features[key] for key in self.shown}
-        self.features["action"] = PolicyFeature(FeatureType.ACTION, (2,))
-
-    @property
-    def package_name(self):
-        return NAME.split("/")[0]
+        pixels = PolicyFeature(FeatureType.VISUAL, (SIZE, SIZE, 3))  # whatever it delivers
+        features = {**self.features, "pixels": pixels}
+        self.features = {key: features[key] for key in (*self.shown, "action")}
 
     @property
     def gym_kwargs(self):
@@ -88,28 +84,10 @@ class StateTeacher(PointTeacher):
         )
 
 
-def demonstrate(root, n_episodes: int = 3, left_out: tuple[str, ...] = ()) -> LeRobotDataset:
-    """Record episodes of the teacher's law, without some of the features."""
+def demonstrate(root, left_out: tuple[str, ...] = (MASK,)) -> LeRobotDataset:
+    """Record three episodes of the teacher's law, without some of the features."""
     image = {"dtype": "image", "shape": (SIZE, SIZE, 3), "names": ["height", "width", "channels"]}
-    features = {key: value for key, value in {**FEATURES, IMAGE: image}.items() if key not in left_out}
+    features = {**FEATURES, IMAGE: image, MASK: image}
+    features = {key: value for key, value in features.items() if key not in left_out}
     dataset = LeRobotDataset.create("local/point_camera", FPS, features, root=root, use_videos=False)
-    env = PointCamera()
-    for seed in range(n_episodes):
-        observation, _ = env.reset(seed=seed)
-        done = False
-        while not done:
-            action = (-GAIN * env.position).astype(np.float32)
-            frame = {
-                STATE: observation["agent_pos"],
-                ENV: observation["environment_state"],
-                IMAGE: observation["pixels"],
-                "action": action,
-                "task": Point.task_description,
-            }
-            observation, reward, done, _, _ = env.step(action)
-            outcome = {"next.reward": np.float32(reward), "next.success": done, "next.done": done}
-            frame |= {key: np.array([value]) for key, value in outcome.items()}
-            dataset.add_frame({key: value for key, value in frame.items() if key not in left_out})
-        dataset.save_episode()
-    dataset.finalize()
-    return LeRobotDataset(dataset.repo_id, root=dataset.root)
+    return point_environment.demonstrate(dataset, 3, MaskedPointCamera(), {**NAMES, "mask": MASK})

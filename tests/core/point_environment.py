@@ -14,6 +14,7 @@ from lerobot.envs import EnvConfig
 from toy_policies import NoisyTeacher
 
 NAME = "lerobot_agpd_tests/Point-v0"
+FEATURE_NAMES = {"agent_pos": "observation.state", "environment_state": "observation.environment_state"}
 FPS, LIMIT, REACHED, GAIN = 10, 12, 0.25, 0.3
 EPISODE_LENGTH = 4  # of the teacher alone, two steps per decision: its distance is 1, .7, .4, .28, .16
 
@@ -67,13 +68,7 @@ class PointEnv(EnvConfig):
             "environment_state": PolicyFeature(FeatureType.ENV, (3,)),
         }
     )
-    features_map: dict[str, str] = field(
-        default_factory=lambda: {
-            "action": "action",
-            "agent_pos": "observation.state",
-            "environment_state": "observation.environment_state",
-        }
-    )
+    features_map: dict[str, str] = field(default_factory=lambda: {"action": "action", **FEATURE_NAMES})
 
     @property
     def package_name(self):
@@ -94,20 +89,16 @@ class PointTeacher(NoisyTeacher):
         return -GAIN * state
 
 
-def demonstrate(dataset: LeRobotDataset, n_episodes: int) -> LeRobotDataset:
-    """Record episodes of the teacher's law into an empty dataset."""
-    env = Point()
+def demonstrate(dataset: LeRobotDataset, n_episodes: int, env=None, names=FEATURE_NAMES) -> LeRobotDataset:
+    """Record episodes of the teacher's law into an empty dataset: those of its features that the environment shows."""
+    env = env or Point()
     for seed in range(n_episodes):
         observation, _ = env.reset(seed=seed)
         done = False
         while not done:
             action = (-GAIN * env.position).astype(np.float32)
-            frame = {
-                "observation.state": observation["agent_pos"],
-                "observation.environment_state": observation["environment_state"],
-                "action": action,
-                "task": Point.task_description,
-            }
+            frame = {name: observation[key] for key, name in names.items() if name in dataset.features}
+            frame |= {"action": action, "task": Point.task_description}
             observation, reward, done, _, _ = env.step(action)
             outcome = {"next.reward": np.float32(reward), "next.success": done, "next.done": done}
             dataset.add_frame({**frame, **{key: np.array([value]) for key, value in outcome.items()}})

@@ -21,11 +21,11 @@ from tiny_policies import (
 )
 
 from lerobot_agpd.config import GuidanceConfig, TeacherConfig
+from lerobot_agpd.fit import check_fit
 from lerobot_agpd.flag_checks import FlagError
 from lerobot_agpd.guidance.adapters.chunk import ChunkTeacher
 from lerobot_agpd.guidance.adapters.diffusion import DiffusionTeacher
 from lerobot_agpd.loading import (
-    check_fit,
     load_pair,
     load_student,
     load_teacher,

@@ -17,8 +17,9 @@ from lerobot_agpd.config import (
     RepresentationConfig,
     TeacherConfig,
 )
+from lerobot_agpd.fit import check_fit
 from lerobot_agpd.flag_checks import FlagError
-from lerobot_agpd.loading import check_fit, collection_environment, load_teacher, read_policy_config
+from lerobot_agpd.loading import collection_environment, load_teacher, read_policy_config
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
 from lerobot_agpd.policies.agpd_diffusion.modeling_agpd_diffusion import AGPDDiffusionPolicy
 from lerobot_agpd.run import RunInfo
@@ -219,7 +220,7 @@ def test_more_executed_steps_than_a_diffusion_student_returns(build, agpd_diffus
 def test_warnings(build, guided_config, caplog, options, flag):
     caplog.set_level(logging.WARNING)
     build(guided_config(collect=collect(**options)))
-    warnings = [record.getMessage() for record in caplog.records if "build" in record.name]
+    warnings = [record.getMessage() for record in caplog.records if "before_training" in record.name]
     assert [flag in warning for warning in warnings] == ([] if flag is None else [True])
 
 

@@ -1,11 +1,12 @@
 """Students that see cameras: a teacher that sees the state, and J on visual features."""
 
 import shutil
+import sys
 
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
-from point_camera import ENV, IMAGE, SIZE, STATE, PointCameraEnv, StateTeacher, demonstrate
+from point_camera import ENV, IMAGE, MASK, SIZE, STATE, PointCameraEnv, StateTeacher, demonstrate
 from point_environment import GAIN
 from toy_run import Run
 from transformers import Dinov2Config, Dinov2Model
@@ -24,7 +25,6 @@ from lerobot_agpd.guidance.visual import MAP_SIZE
 from lerobot_agpd.policies.agpd.modeling_agpd import AGPDPolicy
 from lerobot_agpd.replay import frame_features
 from lerobot_agpd.run import RunInfo
-from lerobot_agpd.textures import Textures
 
 FEATURES = {
     STATE: PolicyFeature(FeatureType.STATE, (2,)),
@@ -110,7 +110,7 @@ def test_an_input_that_the_demonstrations_lack(start):
 
 
 def test_demonstrations_without_what_the_teacher_sees(start, tmp_path):
-    blind = demonstrate(tmp_path / "blind", left_out=(ENV,))
+    blind = demonstrate(tmp_path / "blind", left_out=(ENV, MASK))
     with pytest.raises(FlagError, match=rf"needs the observations .*{ENV}.* has .*{IMAGE}.*differ in"):
         start(dataset=blind)
 
@@ -131,26 +131,15 @@ def test_images_of_another_size_are_refused_before_training(start):
 # ---- backgrounds ----
 
 
-def test_training_images_get_other_backgrounds(start, camera_demonstrations):
-    run = start()
-    plain = run.agpd.train_batch(run.batch())
-    replay = run.agpd.replay
-    replay.backgrounds = Textures("noise", "--flag")
-    read = replay.frames.images
-    with_masks = lambda index, keys, n=None: {  # noqa: E731  # the lower half is the background
-        key: (torch.arange(SIZE) >= SIZE // 2)[:, None].expand(len(index), 3, SIZE, SIZE).to(torch.uint8)
-        * 255
-        if key.endswith("_mask")
-        else read(index, [key], n)[key]
-        for key in keys
-    }
-    replay.frames.images = with_masks
-    other = run.agpd.train_batch(run.batch())
-    top = slice(0, SIZE // 2)
-    torch.testing.assert_close(other[IMAGE][..., top, :], plain[IMAGE][..., top, :])
-    assert not torch.isclose(other[IMAGE][..., SIZE // 2 :, :], plain[IMAGE][..., SIZE // 2 :, :]).all()
-    held_out = replay.eval_batch(run.batch())[IMAGE]
-    torch.testing.assert_close(held_out, plain[IMAGE])
+def test_training_images_get_other_backgrounds(start, tmp_path):
+    masked, alone = demonstrate(tmp_path / "masked", left_out=()), {"every": 0}
+    plain_run = start(masked, collect=alone)
+    run = start(masked, collect=alone, replay=ReplayConfig(backgrounds="noise"))
+    plain, other = (each.agpd.train_batch(each.batch())[IMAGE] for each in (plain_run, run))
+    top, bottom = slice(0, SIZE // 2), slice(SIZE // 2, SIZE)
+    torch.testing.assert_close(other[..., top, :], plain[..., top, :])
+    assert not torch.isclose(other[..., bottom, :], plain[..., bottom, :]).all()
+    torch.testing.assert_close(run.agpd.replay.eval_batch(run.batch())[IMAGE], plain)
 
 
 def test_backgrounds_without_masks_are_refused(start):
@@ -216,6 +205,14 @@ def test_a_student_acts_without_the_dino_that_it_was_trained_with(start, dino, t
     assert loaded.representation is None and "J cannot be computed" in caplog.text
     batch = run.batch()
     torch.testing.assert_close(loaded.predict_action_chunk(batch), run.policy.predict_action_chunk(batch))
+
+
+def test_a_dino_needs_transformers(start, dino, monkeypatch):
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with pytest.raises(
+        FlagError, match="--policy.representation.encoder=.* needs the package 'transformers'"
+    ):
+        start(representation=RepresentationConfig("visual", dino))
 
 
 @pytest.mark.parametrize(

@@ -15,11 +15,12 @@ IMAGE = "observation.image"
 
 @pytest.fixture
 def make_student(agpd_config, input_features):
-    def build(encoder, **options) -> AGPDPolicy:
+    def build(encoder, dataset_meta=None, **options) -> AGPDPolicy:
         image = {IMAGE: PolicyFeature(FeatureType.VISUAL, (3, 40, 40))}
         features = {"observation.state": input_features["observation.state"], **image}
         options = {"pretrained_backbone_weights": None, "use_vae": False, **options}
-        return AGPDPolicy(agpd_config(input_features=features, encoder=encoder, **options))
+        config = agpd_config(input_features=features, encoder=encoder, **options)
+        return AGPDPolicy(config, dataset_meta=dataset_meta)
 
     return build
 
@@ -59,9 +60,8 @@ def test_images_are_shifted_in_training_alone():
     assert torch.equal(encoder(images)["feature_map"], encoder(images)["feature_map"])
 
 
-@pytest.mark.parametrize("name", ["resnet18"])
-def test_group_norm_keeps_activations_in_scale(name):
-    encoder = GroupNormResNet(name)
+def test_group_norm_keeps_activations_in_scale():
+    encoder = GroupNormResNet("resnet18")
     features = encoder(torch.randn(2, 3, 64, 64) * 20)["feature_map"]
     assert features.shape == (2, encoder.out_channels, 2, 2)
     assert 0.1 < features.std() < 10
@@ -108,7 +108,6 @@ def test_a_small_student_overfits_where_a_dot_is(make_student):
     ("encoder", "warned"), [("resnet", True), ("resnet_group_norm", False), ("small", False)]
 )
 def test_an_unnormalized_resnet_is_warned_of(make_student, demonstrations, caplog, encoder, warned):
-    student = make_student(encoder)
     with caplog.at_level(logging.WARNING):
-        student._choose_encoder(is_new=True)
+        make_student(encoder, demonstrations.meta)
     assert ("not normalized" in caplog.text) == warned

@@ -17,15 +17,9 @@ from rich.console import Console
 from lerobot_agpd.cli.command import entry_point, machine_device
 from lerobot_agpd.config import EVALUATION_SEEDS, TeacherConfig
 from lerobot_agpd.files import write_json
+from lerobot_agpd.fit import check_fit, check_teacher
 from lerobot_agpd.flag_checks import require
-from lerobot_agpd.loading import (
-    check_fit,
-    check_teacher,
-    load_student,
-    load_teacher,
-    read_policy_config,
-    require_student,
-)
+from lerobot_agpd.loading import load_student, load_teacher, read_policy_config, require_student
 from lerobot_agpd.studies.evaluation import Evaluator
 from lerobot_agpd.studies.probe import TeacherProbe
 from lerobot_agpd.studies.probe_picture import draw_probe

@@ -34,12 +34,7 @@ class AlohaStateEnvConfig(SimulatedEnvConfig):
     """ALOHA's simulated tasks, seen through joints and object poses, or through cameras of any size."""
 
     tasks = TASKS
-    obs_types = (
-        "environment_state_agent_pos",
-        "pixels_agent_pos",
-        "pixels",
-        "pixels_environment_state_agent_pos",
-    )
+    obs_types = ("environment_state_agent_pos", *SimulatedEnvConfig.obs_types[1:])
 
     # AlohaTransferCube-v0 or AlohaInsertion-v0.
     task: str | None = "AlohaTransferCube-v0"

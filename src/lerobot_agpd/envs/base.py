@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -13,7 +13,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_IMAGES
 
 from lerobot_agpd.envs.view import AGENT_POS, ENVIRONMENT_STATE, PIXELS, TaskSpec, View
 from lerobot_agpd.flag_checks import require
-from lerobot_agpd.textures import Textures, mask_of
+from lerobot_agpd.textures import Textures
 
 OBSERVED_KEYS: dict[str, tuple[str, ...]] = {
     "state": (AGENT_POS, ENVIRONMENT_STATE),
@@ -57,7 +57,6 @@ class SimulatedEnvConfig(EnvConfig):
         "pixels",
         "pixels_environment_state_agent_pos",
     )
-    has_masks: ClassVar[bool] = True
 
     # Control steps per second; default: the task's, the only possible value.
     fps: int | None = None
@@ -75,7 +74,7 @@ class SimulatedEnvConfig(EnvConfig):
     visualization_width: int = 480
     # Draw shadows; without a GPU an image is several times faster without.
     shadows: bool = True
-    # Smooth edges; without a GPU an image takes a third of the time without.
+    # Draw smooth edges; without a GPU an image is faster without.
     antialiasing: bool = True
     # Show masks too, one image per camera, <camera>_mask: white where nothing can move.
     masks: bool = False
@@ -118,16 +117,16 @@ class SimulatedEnvConfig(EnvConfig):
         for option in ("masks", "background"):
             value = getattr(self, option)
             require(
-                not value or (shows_cameras and self.has_masks),
-                f"--env.{option}={value}: --env.type={self.type} has masks for named cameras alone, of MuJoCo; choose some "
-                "with --env.cameras and show them (--env.obs_type)",
+                not value or shows_cameras,
+                f"--env.{option}={value}: there are masks for named cameras alone, if --env.type={self.type} has any; choose "
+                "some with --env.cameras and show them (--env.obs_type)",
             )
         if self.background is not None:
             Textures(self.background, "--env.background")
 
     def _set_features(self) -> None:
         view = self.view
-        names = [*view.cameras, *(mask_of(camera) for camera in view.cameras if self.masks)]
+        names = replace(view, masks=self.masks).image_names
         images = {f"{PIXELS}/{name}": f"{OBS_IMAGES}.{name}" for name in names}
         images = (images or {PIXELS: OBS_IMAGE}) if PIXELS in view.keys else {}
         vectors = {

@@ -30,13 +30,7 @@ class PushTStateEnvConfig(SimulatedEnvConfig):
     """Push-T, seen through corners and the agent's position, or through an image too."""
 
     tasks = TASKS
-    has_masks = False
-    obs_types = (
-        "environment_state_agent_pos",
-        "pixels_agent_pos",
-        "pixels",
-        "pixels_environment_state_agent_pos",
-    )
+    obs_types = ("environment_state_agent_pos", *SimulatedEnvConfig.obs_types[1:])
 
     # PushT-v0.
     task: str | None = "PushT-v0"

@@ -126,11 +126,10 @@ class ViewedEnv(gym.Env):
         if view.main_pose is not None:
             self.main_camera = free_camera(view.main_pose)
         image = gym.spaces.Box(0, 255, (*view.observation_size, 3), np.uint8)
-        names = [*view.cameras, *(mask_of(camera) for camera in view.cameras if view.masks)]
         spaces: dict[str, gym.Space] = {
             AGENT_POS: gym.spaces.Box(-np.inf, np.inf, (spec.agent_pos_dim,), np.float32),
             ENVIRONMENT_STATE: gym.spaces.Box(-np.inf, np.inf, (spec.environment_state_dim,), np.float32),
-            PIXELS: gym.spaces.Dict(dict.fromkeys(names, image)) if names else image,
+            PIXELS: gym.spaces.Dict(dict.fromkeys(view.image_names, image)) if view.cameras else image,
         }
         self.observation_space = gym.spaces.Dict({key: spaces[key] for key in view.keys})
 
@@ -140,22 +139,25 @@ class ViewedEnv(gym.Env):
         self.state = {key: vector.astype(np.float32) for key, vector in vectors.items()}
         observation: dict[str, Any] = {key: self.state[key] for key in self.view.keys if key != PIXELS}
         if PIXELS in self.view.keys:
-            size = self.view.observation_size
-            images: dict[str, np.ndarray] = {}
-            for name in self.view.cameras:
-                camera = self.cameras.get(name, name)
-                images[name] = self._image(camera, size)
-                if self.view.masks:
-                    images[mask_of(name)] = self.scene_renderer.background(*self.scene(), camera, size)
-            observation[PIXELS] = images or self._image(self.main_camera, size)
+            observation[PIXELS] = self._pixels(*self.scene())
         return observation
+
+    def _pixels(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray | dict[str, np.ndarray]:
+        """The observed image of the main camera, or those of the named cameras and their masks."""
+        renderer, size = self.scene_renderer, self.view.observation_size
+        if not self.view.cameras:
+            return renderer.render(model, data, self.main_camera, size)
+        images = {}
+        for name in self.view.cameras:
+            camera = self.cameras.get(name, name)
+            images[name] = renderer.render(model, data, camera, size)
+            if self.view.masks:
+                images[mask_of(name)] = renderer.background(model, data, camera, size)
+        return images
 
     def render(self) -> np.ndarray:
         """Render a frame (height, width, 3) of the main camera."""
-        return self._image(self.main_camera, self.view.visualization_size)
-
-    def _image(self, camera: Camera, size: tuple[int, int]) -> np.ndarray:
-        return self.scene_renderer.render(*self.scene(), camera, size)
+        return self.scene_renderer.render(*self.scene(), self.main_camera, self.view.visualization_size)
 
     @abstractmethod
     def scene(self) -> tuple[mujoco.MjModel, mujoco.MjData]:

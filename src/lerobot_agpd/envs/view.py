@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from lerobot_agpd.envs.poses import CameraPose
+from lerobot_agpd.textures import mask_of
 
 AGENT_POS = "agent_pos"
 ENVIRONMENT_STATE = "environment_state"
@@ -42,7 +43,7 @@ class View:
         observation_size: of observed images.
         visualization_size: of rendered frames.
         shadows: whether images show them; without a GPU they take most of the time.
-        antialiasing: whether edges are smooth; without a GPU images take a third of the time without.
+        antialiasing: whether edges are smooth; without a GPU an image is faster without.
         poses: of those cameras that are not the model's.
         masks: whether the background's mask is observed with every camera.
         main_pose: of rendered frames, and of an observed image without a name; None: the environment's own.
@@ -57,3 +58,8 @@ class View:
     poses: Mapping[str, CameraPose] = field(default_factory=dict)
     main_pose: CameraPose | None = None
     masks: bool = False
+
+    @property
+    def image_names(self) -> list[str]:
+        """Observed images that have a name: those of the cameras, and their masks."""
+        return [*self.cameras, *(mask_of(camera) for camera in self.cameras if self.masks)]

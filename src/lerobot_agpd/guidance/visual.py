@@ -73,13 +73,19 @@ class DinoEncoder(VisualEncoder):
         device: where it runs.
 
     Raises:
-        FlagError: if there is no such model.
+        FlagError: if there is no such model, or transformers is not installed.
     """
 
     is_frozen = True
 
     def __init__(self, name: str, cameras: tuple[str, ...], device: str):
-        from transformers import Dinov2Config  # takes seconds, and few runs need it
+        try:
+            from transformers import Dinov2Config  # takes seconds, and few runs need it
+        except ModuleNotFoundError as error:
+            raise FlagError(
+                f"--policy.representation.encoder='{name}' needs the package {error.name!r}, which is not installed; run "
+                f"pip install 'lerobot[transformers-dep]', or use the student's own features ('{STUDENT}')"
+            ) from error
 
         self.name, self.cameras, self.device = name, cameras, device
         config: Any = self._read(Dinov2Config)
@@ -125,10 +131,10 @@ class DinoEncoder(VisualEncoder):
         mean, std = (
             torch.tensor(values).view(3, 1, 1).to(images) for values in (IMAGENET_MEAN, IMAGENET_STD)
         )
-        patches = self.model((resized - mean) / std).last_hidden_state[
-            :, 1:
-        ]  # (B, h * w, F), without the class token
-        return pooled(patches.transpose(1, 2).unflatten(2, (height // patch, width // patch)))
+        tokens = self.model(
+            (resized - mean) / std
+        ).last_hidden_state  # (B, 1 + h * w, F), the class token first
+        return pooled(tokens[:, 1:].transpose(1, 2).unflatten(2, (height // patch, width // patch)))
 
 
 def pooled(maps: Tensor) -> Tensor:

@@ -29,7 +29,7 @@ RESNET_GROUP_SIZE = 16
 
 
 class SmallEncoder(nn.Module):
-    """Four convolutions and a linear layer: about 1 ms of one core for an image of 96 x 96, backward pass included.
+    """Four convolutions and a linear layer, for a CPU.
 
     The whole image becomes one token, so it costs ACT's transformer as much as a state. In training every image is
     shifted by up to `shift` pixels (DrQ, arXiv:2004.13649).

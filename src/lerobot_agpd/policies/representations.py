@@ -32,8 +32,7 @@ class StudentFeatures(VisualEncoder):
     def __init__(self, student: Student):
         self.student = student
         blank = {
-            key: torch.zeros(1, *feature.shape, device=next(student.parameters()).device)
-            for key, feature in student.config.image_features.items()
+            key: torch.zeros(1, *feature.shape) for key, feature in student.config.image_features.items()
         }
         with torch.no_grad():
             _, self.n_tokens, self.dim = self._tokens(blank, lambda key, images: images).shape
@@ -42,7 +41,8 @@ class StudentFeatures(VisualEncoder):
         """Nothing: the student is there."""
 
     def _tokens(self, images: Mapping[str, Tensor], normalize: Normalize) -> Tensor:
-        images = {key: normalize(key, values) for key, values in images.items()}
+        device = next(self.student.parameters()).device  # histories of a rollout are on the CPU
+        images = {key: normalize(key, values).to(device) for key, values in images.items()}
         was_training = self.student.training
         self.student.eval()  # no random shifts
         try:

@@ -78,18 +78,17 @@ class CameraFrames:
             for row in np.flatnonzero(demonstrated):
                 frames[row] = self._demonstrated[key][index[row]]
             for row in np.flatnonzero(~demonstrated):
-                frames[row] = self._collected_frames(int(episode[row]), key)[step[row]]
+                frame = self._collected_frames(int(episode[row]), key)[step[row]]
+                frames[row] = frame.astype(np.float32) / 255 if key in self._depth_keys else frame
             # One copy of every frame; the permuted view is what convolutions call channels last.
             images[key] = torch.from_numpy(np.stack(frames)).permute(0, 3, 1, 2)  # type: ignore[arg-type]  # all are found
         return images
 
     def _collected_frames(self, episode: int, key: str) -> Array:
-        """A camera's frames (T, H, W, C) of an episode of T."""
+        """A camera's frames (T, H, W, C) in uint8 of an episode of T."""
         number = episode - self._n_demonstrations
         frames = self._held.get((number, key))
-        if frames is None:
-            frames = self._collected[number].column(key)
-        return frames.astype(np.float32) / 255 if key in self._depth_keys else frames
+        return self._collected[number].column(key) if frames is None else frames
 
     def _decode_missing(self, index: Array) -> None:
         for row in index[~self._decoded[index]]:

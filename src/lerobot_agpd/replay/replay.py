@@ -93,7 +93,6 @@ class Replay:
         self.config = config
         self.image_transforms, self.backgrounds = image_transforms, backgrounds
         self._far_values = FarValues()
-        self.n_demonstrations = len(self.table.lengths)
         self.n_demonstration_frames = len(self.table)
         self.seen_episodes: set[int] = set()
         n_dropped: int = getattr(config, "drop_n_last_frames", 0)  # ACT has no such setting
@@ -186,11 +185,11 @@ class Replay:
         """A batch of given frames, read from memory and disk."""
         length, device = self.config.history_length, self.demonstrations.device
         gathered = self.demonstrations.gather_batch(frame_index, self.config.chunk_delta_indices, length)
-        histories = self.history(frame_index, self._cameras, length or 1) if self._cameras else {}
+        images = self.frames.images(frame_index, self._cameras, length) if self._cameras else {}
         like = torch.empty(0, device=device)
-        for key in self._cameras:
-            images = self._normalized(key, histories[key], like, augment=False)
-            gathered[key] = images[:, 0] if length is None else images
+        gathered |= {
+            key: self._normalized(key, values, like, augment=False) for key, values in images.items()
+        }
         return {**gathered, FRAME_INDEX: frame_index.to(device)}
 
     def eval_batch(self, batch: Batch) -> Batch:
@@ -210,20 +209,18 @@ class Replay:
 
         In training, where there is an `rng`, they are augmented: transformed, and before other backgrounds.
         """
-        augment = rng is not None
         if not self._cameras:
             return {}
-        n_obs_steps = self.config.history_length
+        augment, n_obs_steps = rng is not None, self.config.history_length
         if rng is not None and self.backgrounds is not None:
-            read = self.frames.images(
-                frame_index, [*self._cameras, *map(mask_of, self._cameras)], n_obs_steps
-            )
+            keys = [*self._cameras, *map(mask_of, self._cameras)]
+            read = self.frames.images(frame_index, keys, n_obs_steps)
             for key in self._cameras:
                 read[key] = replace_backgrounds(read[key], read[mask_of(key)], self.backgrounds, rng)
             return {key: self._normalized(key, read[key], batch[key], augment) for key in self._cameras}
         if n_obs_steps is not None:
-            histories = self.frames.images(frame_index, self._cameras, n_obs_steps)
-            return {key: self._normalized(key, histories[key], batch[key], augment) for key in self._cameras}
+            read = self.frames.images(frame_index, self._cameras, n_obs_steps)
+            return {key: self._normalized(key, read[key], batch[key], augment) for key in self._cameras}
         images = {key: batch[key] for key in self._cameras}
         exchanged = frame_index != batch["index"]
         if exchanged.any():
