@@ -150,6 +150,7 @@ def export_onnx(loaded: LoadedPolicy, folder: Path) -> OnnxExport:
         scale = max(1.0, float(np.abs(expected).max()))
         difference = max(difference, float(np.abs(expected - got).max()) / scale)
     if difference > TOLERANCE:
+        path.unlink()
         raise RuntimeError(f"the chunks of {path} differ from the policy's by {difference:.2e}")
     one = graph.examples(batch_size=1, seed=1)
     torch_ms, onnx_ms = (

@@ -62,6 +62,8 @@ def distillation_facts(agpd: AGPD, n_parameters: int, dataset: LeRobotDatasetMet
         explanation = COLLECTED if teacher else SELF_TAUGHT
     else:
         explanation = OFFLINE if config.uses_teacher else CLONED
+    if config.collect.keep_failures:
+        explanation = explanation.replace("episodes that succeeded", "episodes")
     article = "An" if kind[0] in "AEIOU" else "A"
     return ModelFacts(
         summary=f"{article} {kind} policy for [LeRobot](https://github.com/huggingface/lerobot). {explanation}",

@@ -80,6 +80,11 @@ class ReportConfig:
         for name, path in named:
             if not Path(path).exists():
                 raise FileNotFoundError(f"'{name}': {path} does not exist")
+        titles = [path.stem for path in self.pictures]
+        require(
+            len(set(titles)) == len(titles),
+            f"--pictures: the page names a picture after its file, and two of {titles} have one name",
+        )
         require(self.episodes >= 2, f"--episodes must be at least 2, got {self.episodes}")
         require(
             self.curve_episodes == 0 or self.curve_episodes >= 2,

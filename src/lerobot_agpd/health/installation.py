@@ -15,11 +15,10 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig
 from packaging.requirements import Requirement
 
+from lerobot_agpd.cards.install import DISTRIBUTION, install_command
 from lerobot_agpd.health.finding import Finding, Severity
 from lerobot_agpd.plugin import ENV_TYPES, POLICY_TYPES
 from lerobot_agpd.trust import plugins
-
-DISTRIBUTION = "lerobot_policy_agpd"
 
 SHOWN = ("lerobot", "torch", "torchvision", "numpy", "datasets", "accelerate", "diffusers", "gymnasium")
 """Packages whose versions say most."""
@@ -50,8 +49,7 @@ def _versions() -> Iterator[Finding]:
         return
     yield Finding(Severity.NOTE, "versions", shown)
     for problem in wrong:
-        remedy = f"pip install --upgrade {DISTRIBUTION}"
-        yield Finding(Severity.BROKEN, "versions", problem, remedy)
+        yield Finding(Severity.BROKEN, "versions", problem, install_command())
 
 
 def _extras() -> Iterator[Finding]:
@@ -115,7 +113,7 @@ def _discovery() -> Iterator[Finding]:
             Severity.BROKEN,
             "discovery",
             f"LeRobot finds no installed distribution {DISTRIBUTION}: its commands know none of our types",
-            f"pip install {DISTRIBUTION}, in the environment of {sys.executable}",
+            f"{install_command()}, in the environment of {sys.executable}",
         )
     for name in sorted(set(names)):
         copies = [entry for entry in distributions() if entry.metadata.get("Name") == name]
